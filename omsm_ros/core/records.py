@@ -1,0 +1,154 @@
+"""Frozen records that modules hand to each other; they mirror the wire contract.
+
+A *block* is a run of consecutive samples of one trigger counter. All quantities
+are SI; arrays are float64 of shape (n,) unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import DataError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+# No device here delivers more in one message; a longer block is a forgery or a wrong unit.
+MAX_BLOCK_SAMPLES = 1_000_000
+
+
+class Status(IntEnum):
+    """Verdict of the probe on one sample (values of ``DistanceBlock.status``)."""
+
+    OK = 0
+    NO_TARGET = 1
+    SATURATED = 2
+    OUT_OF_RANGE = 3
+    LOST = 4
+
+
+def _empty_f32() -> NDArray[np.float32]:
+    return np.empty(0, np.float32)
+
+
+def _empty_u8() -> NDArray[np.uint8]:
+    return np.empty(0, np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Block:
+    """What every block has: when and where in the trigger count it lies.
+
+    stamp_ns: time of the first sample [ns, ROS time]
+    first_sample: trigger counter of the first sample
+    sample_period: [s]
+    """
+
+    stamp_ns: int
+    first_sample: int
+    sample_period: float
+
+    def __len__(self) -> int:
+        """Samples in the block."""
+        raise NotImplementedError
+
+    def _check(self, name: str, lengths: set[int]) -> None:
+        if len(lengths) != 1:
+            raise DataError(f"{name}: channels of different lengths {sorted(lengths)!r}")
+        (length,) = lengths
+        if not 0 < length <= MAX_BLOCK_SAMPLES:
+            raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")
+        if not (np.isfinite(self.sample_period) and self.sample_period > 0):
+            raise DataError(
+                f"{name}: sample_period {self.sample_period!r} s, expected a positive number"
+            )
+        if self.first_sample < 0:
+            raise DataError(f"{name}: first_sample {self.first_sample!r} is negative")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisBlock(Block):
+    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+    def __post_init__(self) -> None:
+        self._check("AxisBlock", {len(a) for a in (self.x, self.y, self.z, self.b, self.c)})
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DistanceBlock(Block):
+    """Probe readings: distance [m] (n,), intensity 0-1 (n,) or (0,), status (n,) or (0,).
+
+    An empty status means that every sample is OK, an empty intensity that the
+    device does not tell.
+    """
+
+    distance: FloatArray
+    intensity: NDArray[np.float32] = field(default_factory=_empty_f32)
+    status: NDArray[np.uint8] = field(default_factory=_empty_u8)
+
+    def __post_init__(self) -> None:
+        optional = {len(a) for a in (self.intensity, self.status) if len(a)}
+        self._check("DistanceBlock", {len(self.distance)} | optional)
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    @property
+    def ok(self) -> BoolArray:
+        """True where the probe gave a usable, finite reading, shape (n,)."""
+        finite = np.isfinite(self.distance)
+        return finite & (self.status == Status.OK) if len(self.status) else finite
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AccelerationBlock(Block):
+    """Acceleration x, y, z [m/s²], each of shape (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+
+    def __post_init__(self) -> None:
+        self._check("AccelerationBlock", {len(a) for a in (self.x, self.y, self.z)})
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SurfacePoints:
+    """Corrected surface points, each array of shape (n,).
+
+    sample: trigger counter (int64)
+    x, y: position in the workpiece frame [m]
+    height: surface height [m] (Eq. 10)
+    dynamic_error: (1 - G_m) X_d [m] (Eq. 5)
+    uncertainty: standard uncertainty of height [m], k = 1
+    intensity: 0-1, NaN where the device does not tell (float32)
+    """
+
+    sample: IntArray
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    dynamic_error: FloatArray
+    uncertainty: FloatArray
+    intensity: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.sample)

@@ -1,0 +1,68 @@
+"""Every error this package raises on purpose, in one tree.
+
+Catch the branch you can do something about; the offline commands turn any of
+them into one line on stderr and exit status 2::
+
+    OmsmError
+    ├── DataError            (ValueError)  numbers that cannot be used as they are
+    │   ├── StepTestError                  no usable steps in the motion
+    │   └── IdentificationError            no trustworthy model in the data
+    ├── ConfigurationError   (ValueError)  a parameter or setting makes no sense
+    ├── FileError            (ValueError)  a file is missing, truncated or foreign
+    │   ├── BagError                       a recording
+    │   ├── CalibrationError               a calibration, or its use where it does not belong
+    │   └── SurfaceError                   a nominal surface description
+    ├── ProtocolError        (ValueError)  bytes that no device of this kind sends
+    └── DeviceError          (OSError)     a device that is absent, silent or lost
+        └── DeviceTimeoutError (TimeoutError)
+
+Each text names the offending value and the remedy.
+"""
+
+
+class OmsmError(Exception):
+    """Base of all deliberate errors of this package."""
+
+
+class DataError(OmsmError, ValueError):
+    """Numbers that cannot be used as they are: wrong shape, unit, NaN, too few."""
+
+
+class StepTestError(DataError):
+    """The motion holds no steps that could identify anything."""
+
+
+class IdentificationError(DataError):
+    """The data do not support a trustworthy transfer function."""
+
+
+class ConfigurationError(OmsmError, ValueError):
+    """A parameter or setting makes no sense."""
+
+
+class FileError(OmsmError, ValueError):
+    """A file is missing, truncated or not what it claims to be."""
+
+
+class BagError(FileError):
+    """A recording cannot be read or lacks what is needed."""
+
+
+class CalibrationError(FileError):
+    """A calibration is malformed, altered, or does not belong to these data."""
+
+
+class SurfaceError(FileError):
+    """A nominal surface description is malformed."""
+
+
+class ProtocolError(OmsmError, ValueError):
+    """Bytes that do not follow the device's protocol."""
+
+
+class DeviceError(OmsmError, OSError):
+    """A device is absent, silent, or its connection was lost."""
+
+
+class DeviceTimeoutError(DeviceError, TimeoutError):
+    """A device did not answer in time."""
