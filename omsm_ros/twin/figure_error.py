@@ -1,0 +1,60 @@
+"""What a turned mirror really looks like: its nominal shape and a figure error on top.
+
+Closed-form and smooth: primary astigmatism (the grip of the chuck), trefoil (three-point
+mounting) and concentric ripple (the slow-tool servo), each oriented by the seed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.records import FloatArray
+from omsm_ros.core.surface import Surface
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
+
+
+@dataclass(frozen=True, slots=True)
+class FigureError:
+    """A surface: ``nominal`` plus a seeded figure error.
+
+    radius: of the aperture [m], where astigmatism and trefoil reach their full size
+    seed: of the orientations of astigmatism and trefoil
+    astigmatism, trefoil, ripple: peak to valley of each part over the aperture [m]
+    ripple_pitch: from crest to crest of the rings [m]
+    """
+
+    nominal: Surface
+    radius: float
+    seed: int = 1
+    astigmatism: float = 80 * NANOMETRE_M
+    trefoil: float = 40 * NANOMETRE_M
+    ripple: float = 8 * NANOMETRE_M
+    ripple_pitch: float = 1.6 * MILLIMETRE_M
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "ripple_pitch"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigurationError(
+                    f"figure error: {name} is {value!r} m, expected a positive number"
+                )
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height [m] at x, y [m], of their broadcast shape."""
+        return self.nominal.height(x, y) + self.error(x, y)
+
+    def error(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height above the nominal surface [m] at x, y [m], of their broadcast shape."""
+        radius, angle = np.hypot(x, y), np.arctan2(y, x)
+        rho = radius / self.radius
+        first, second = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, 2)
+        # The even cosine keeps the rings smooth at the centre.
+        return np.asarray(
+            self.astigmatism / 2 * rho**2 * np.cos(2 * angle - first)
+            + self.trefoil / 2 * rho**3 * np.cos(3 * angle - second)
+            + self.ripple / 2 * np.cos(2 * np.pi * radius / self.ripple_pitch),
+            np.float64,
+        )

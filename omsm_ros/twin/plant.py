@@ -1,0 +1,139 @@
+"""What moves: a servo axis that follows its command, and a probe that follows the axis.
+
+``command → servo → X_d (encoder) → G(s) → true motion of the probe``
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, signal
+
+from omsm_ros.core.records import FloatArray
+from omsm_ros.core.trajectory import Motion
+from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.errors import ConfigurationError
+
+PAPER_EQ_12 = TransferFunction.from_ascending(
+    # The print lacks the s behind 1.22e8; without it the plant would be unstable.
+    [1.26e12, -3.07e8, 1.29e5],
+    [1.27e12, 1.22e8, 5.17e4, 1.0],
+)
+"""The paper's identified G_m (Eq. 12), DC gain 1.26/1.27 as printed."""
+
+PAPER_STATIC_GAIN = PAPER_EQ_12.dc_gain
+
+# Slower than this, the rest of the lead-in would still be seen in the first sample.
+_LEAD_IN_TIME_CONSTANTS = 40
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A critically damped servo of ``servo_bandwidth`` [Hz] and the probe's dynamics G(s)."""
+
+    dynamics: TransferFunction = PAPER_EQ_12.normalised()
+    servo_bandwidth: float = 200.0
+
+    def __post_init__(self) -> None:
+        if not self.dynamics.is_stable:
+            raise ConfigurationError(f"plant with poles {self.dynamics.poles()!r} is unstable")
+        if not self.servo_bandwidth > 0:
+            raise ConfigurationError(f"servo_bandwidth {self.servo_bandwidth!r} Hz is not positive")
+
+    @property
+    def servo(self) -> TransferFunction:
+        """1 / (1 + s/ω)², ω = 2π · servo_bandwidth."""
+        omega = 2 * np.pi * self.servo_bandwidth
+        return TransferFunction.from_ascending([1.0], [1.0, 2 / omega, 1 / omega**2])
+
+    def lead_in(self) -> float:
+        """How long the cell must have been moving before its start is forgotten [s]."""
+        slowest = min(-np.r_[self.servo.poles(), self.dynamics.poles()].real)
+        return float(_LEAD_IN_TIME_CONSTANTS / slowest + self.dynamics.delay)
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """True motion at the sample instants [m], each (n,): of the carriage and of the probe."""
+
+    carriage: FloatArray
+    probe: FloatArray
+
+
+def respond(
+    plant: Plant, motion: Motion, samples: int, sample_period: float, substeps: int = 16
+) -> Response:
+    """Move the plant through ``motion`` and look at it every ``sample_period`` [s].
+
+    Each sample period is cut into ``substeps``; the command is held at its value in the
+    middle of each, which is exact for a sharp step on the grid and of second order for
+    a smooth motion. The delay is taken in the argument of the command, so it is exact too.
+    """
+    step = sample_period / substeps
+    lead = int(np.ceil(plant.lead_in() / sample_period)) * substeps
+    middles = (np.arange(-lead, samples * substeps) + 0.5) * step
+    servo, both = plant.servo, _series(plant.servo, plant.dynamics)
+
+    def seen_through(system: TransferFunction, delay: float) -> FloatArray:
+        command = motion.positions(middles - delay).z
+        moved = _held_response(system, command, step)
+        return moved[lead - 1 :: substeps][:samples]
+
+    return Response(
+        carriage=seen_through(servo, 0.0), probe=seen_through(both, plant.dynamics.delay)
+    )
+
+
+def _series(first: TransferFunction, second: TransferFunction) -> TransferFunction:
+    multiply = np.polynomial.polynomial.polymul
+    return TransferFunction(
+        multiply(first.numerator, second.numerator),
+        multiply(first.denominator, second.denominator),
+    )
+
+
+def _held_response(system: TransferFunction, held: FloatArray, step: float) -> FloatArray:
+    """Response at the end of each step to an input held over it, from steady state, (n,)."""
+    start = held[0]
+    sections = _zero_order_hold_sections(system, step)
+    return np.asarray(signal.sosfilt(sections, held - start) + system.dc_gain * start)
+
+
+def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArray:
+    """Second-order sections from the held input of a step to the output at its end.
+
+    Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the held system;
+    the gain follows from G(0). A single polynomial of all of them would lose digits.
+    """
+    a, b, c, d = signal.cont2discrete(_state_space(system, 1 / step), 1.0, method="zoh")[:4]
+    n = len(a)
+    # y at the end of the step: C x[k+1] + D u[k] = C A x[k] + (C B + D) u[k].
+    pencil = np.block([[a, b], [c @ a, c @ b + d]])
+    mass = linalg.block_diag(np.eye(n), 0.0)
+    zeros = linalg.eigvals(pencil, mass)
+    zeros = zeros[np.isfinite(zeros) & (abs(zeros) < 1e6)]
+    poles = np.exp(system.poles() * step)
+    gain = system.dc_gain * np.real(_at_one(poles) / _at_one(zeros))
+    return np.asarray(signal.zpk2sos(zeros, poles, gain))
+
+
+def _at_one(roots: ComplexArray) -> complex:
+    return complex(np.prod(1 - roots))
+
+
+def _state_space(
+    system: TransferFunction, rate: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Controllable canonical form, time in units of 1/rate to keep its entries near 1."""
+    order = len(system.denominator) - 1
+    leading = system.denominator[-1] * rate**order
+    monic = system.denominator * rate ** np.arange(order + 1) / leading
+    numerator = np.zeros(order + 1)
+    used = len(system.numerator)
+    numerator[:used] = system.numerator * rate ** np.arange(used) / leading
+    a = np.eye(order, k=1)
+    a[-1] = -monic[:-1]
+    b = np.eye(order)[:, -1:]
+    c = (numerator[:-1] - numerator[-1] * monic[:-1])[np.newaxis]
+    return a, b, c, numerator[-1:, np.newaxis]

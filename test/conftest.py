@@ -1,0 +1,44 @@
+"""Recordings of the twin that several tests look at; made once, never changed."""
+
+import pytest
+
+from omsm_ros.core.calibration import Calibration
+from omsm_ros.twin.cell import blocks_of
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+
+# A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000.
+SMALL = Scenario(start_radius=2e-3)
+
+
+@pytest.fixture(scope="session")
+def small_scan():
+    return scan_of(SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_scan_blocks(small_scan):
+    return blocks_of(small_scan)
+
+
+@pytest.fixture(scope="session")
+def step_test():
+    return step_test_of(SMALL)
+
+
+@pytest.fixture(scope="session")
+def true_calibration():
+    """The calibration that an identification without noise would give."""
+    import numpy as np
+
+    dynamics = Plant().dynamics
+    p = len(dynamics.numerator) + len(dynamics.denominator)
+    return Calibration(
+        dynamics=dynamics,
+        static_gain=PAPER_STATIC_GAIN,
+        sample_period=SMALL.sample_period,
+        valid_up_to=100.0,
+        covariance=np.zeros((p, p)),
+        settings={"machine": "twin"},
+        certificate={"verdict": "accepted"},
+    )
