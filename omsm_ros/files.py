@@ -1,0 +1,205 @@
+"""Calibration, cloud, surface and summary files; a file appears only when it is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import jsonschema
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from omsm_ros.core.calibration import SCHEMA, Calibration, content_id
+from omsm_ros.core.cloud import CLOUD_FIELDS, pack_points
+from omsm_ros.core.records import SurfacePoints
+from omsm_ros.core.surface import Surface, surface_from_description
+from omsm_ros.errors import CalibrationError, FileError, SurfaceError
+
+MAX_CALIBRATION_BYTES = 4_000_000
+MAX_SURFACE_BYTES = 100_000
+
+_COEFFICIENTS = {"type": "array", "items": {"type": "number"}, "minItems": 1, "maxItems": 64}
+_CALIBRATION_SCHEMA = {
+    "type": "object",
+    "additionalProperties": False,
+    "properties": {
+        "schema": {"const": SCHEMA},
+        "id": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+        "numerator": _COEFFICIENTS,
+        "denominator": _COEFFICIENTS,
+        "delay": {"type": "number", "minimum": 0},
+        "static_gain": {"type": "number"},
+        "sample_period": {"type": "number", "exclusiveMinimum": 0},
+        "valid_up_to": {"type": "number", "exclusiveMinimum": 0},
+        "covariance": {"type": "array", "items": {"type": "number"}, "maxItems": 16384},
+        "settings": {"type": "object"},
+        "certificate": {"type": "object"},
+    },
+}
+_CALIBRATION_SCHEMA["required"] = list(_CALIBRATION_SCHEMA["properties"])  # type: ignore[call-overload]
+
+
+@contextmanager
+def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open ``path`` for writing under a temporary name; rename it when all went well."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{target.name}.part")
+    try:
+        with part.open(mode) as stream:
+            yield stream
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _read_text(path: Path, limit: int, error: type[FileError], what: str) -> str:
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise error(f"{what} {str(path)!r} has {size} bytes, at most {limit} are accepted")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as err:
+        raise error(f"no {what} at {str(path)!r}; check the path") from err
+    except (OSError, UnicodeDecodeError) as err:
+        raise error(f"{what} {str(path)!r} cannot be read as text: {err}") from err
+
+
+# --------------------------------------------------------------------------- calibration
+
+
+def save_calibration(path: Path | str, calibration: Calibration) -> None:
+    """Write ``CAL.json`` (schema "omsm-calibration/1")."""
+    with whole_file(path, "w") as stream:
+        json.dump({"id": calibration.id, **calibration.content()}, stream, indent=1)
+        stream.write("\n")
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read ``CAL.json``; CalibrationError if it is malformed, altered or unstable."""
+    path = Path(path)
+    text = _read_text(path, MAX_CALIBRATION_BYTES, CalibrationError, "calibration")
+    try:
+        content = json.loads(text, parse_constant=_no_constant)
+        jsonschema.validate(content, _CALIBRATION_SCHEMA)
+    except jsonschema.ValidationError as err:
+        raise CalibrationError(
+            f"{str(path)!r} is not a calibration: {err.json_path}: {err.message[:200]}"
+        ) from err
+    except (ValueError, RecursionError) as err:
+        raise CalibrationError(
+            f"{str(path)!r} is not a calibration: not JSON ({err}); make one with 'omsm identify'"
+        ) from err
+    stored = content.pop("id")
+    if stored != content_id(content):
+        raise CalibrationError(
+            f"{str(path)!r} was altered after it was made: id {stored!r} does not match its "
+            f"content {content_id(content)!r}; identify it again"
+        )
+    try:
+        return Calibration.from_content(content)
+    except CalibrationError as err:
+        raise CalibrationError(f"{str(path)!r}: {err}") from err
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+# --------------------------------------------------------------------------------- cloud
+
+
+class PlyWriter:
+    """Streams points into a binary ``cloud.ply`` of the contract's fields.
+
+    Memory does not depend on the number of points: the header is written last, into the
+    room kept for it. Leaving by an exception leaves no file.
+    """
+
+    _PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
+    _HEADER_BYTES = 512
+    _DTYPE = np.dtype(list(CLOUD_FIELDS))
+
+    def __init__(self, path: Path | str, comment: str = "") -> None:
+        self._file = whole_file(path)
+        # A line break in a comment would end it and forge header lines.
+        self._comment = " ".join(comment.split())[:200]
+        self.points = 0
+
+    def __enter__(self) -> PlyWriter:
+        self._stream = self._file.__enter__()
+        self._stream.write(self._header())
+        return self
+
+    def write(self, points: SurfacePoints) -> None:
+        """Append points."""
+        packed = pack_points(points).astype(self._DTYPE)
+        self._stream.write(packed.tobytes())
+        self.points += len(packed)
+
+    def _header(self) -> bytes:
+        lines = ["ply", "format binary_little_endian 1.0", f"comment {self._comment}"]
+        lines += [f"element vertex {self.points}"]
+        lines += [f"property {self._PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
+        text = "\n".join(lines) + "\n"
+        padding = self._HEADER_BYTES - len(text) - len("comment \nend_header\n")
+        return f"{text}comment {' ' * padding}\nend_header\n".encode("ascii", "replace")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._stream.seek(0)
+            self._stream.write(self._header())
+        self._file.__exit__(kind, error, trace)
+
+
+def read_ply(path: Path | str) -> NDArray[np.void]:
+    """Points of our own ``cloud.ply`` as a structured array (n,) of the contract's fields."""
+    raw = Path(path).read_bytes()
+    head, mark, body = raw.partition(b"end_header\n")
+    if not raw.startswith(b"ply\n") or not mark:
+        raise FileError(f"{str(path)!r} is not a PLY file")
+    count = next(
+        (int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element vertex")),
+        -1,
+    )
+    dtype = np.dtype(list(CLOUD_FIELDS))
+    if count < 0 or len(body) != count * dtype.itemsize:
+        raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
+    return np.frombuffer(body, dtype)
+
+
+# --------------------------------------------------------------------- surface, summary
+
+
+def load_surface(path: Path | str) -> Surface:
+    """Read ``SURFACE.yaml``: ``shape`` and its parameters in metres."""
+    path = Path(path)
+    text = _read_text(path, MAX_SURFACE_BYTES, SurfaceError, "surface")
+    try:
+        description = yaml.safe_load(text)
+    except yaml.YAMLError as err:
+        raise SurfaceError(f"{str(path)!r} is not YAML: {err}".replace("\n", " ")) from err
+    if not isinstance(description, dict):
+        raise SurfaceError(f"{str(path)!r} holds {description!r:.80}, expected shape and lengths")
+    try:
+        return surface_from_description(description)
+    except SurfaceError as err:
+        raise SurfaceError(f"{str(path)!r}: {err}") from err
+
+
+def save_json(path: Path | str, content: Mapping[str, object]) -> None:
+    """Write a JSON object for people and programs."""
+    with whole_file(path, "w") as stream:
+        json.dump(content, stream, indent=1, allow_nan=False)
+        stream.write("\n")
