@@ -1,0 +1,122 @@
+"""A finished measurement: its cloud, its summary and its page in one folder."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros import __version__, offline
+from omsm_ros.core import form
+from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.correct import CorrectionOptions
+from omsm_ros.core.surface import Surface
+from omsm_ros.files import read_ply, save_json, whole_file
+from omsm_ros.report.cloud_view import CloudView
+from omsm_ros.report.gallery import surface_figures
+from omsm_ros.report.page import Report, render
+
+CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
+
+
+def measure(
+    bag: Path,
+    calibration: Calibration,
+    out: Path,
+    *,
+    nominal: Surface | None = None,
+    options: CorrectionOptions | None = None,
+    progress: offline.Progress = offline.no_progress,
+) -> dict[str, Any]:
+    """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary."""
+    account = offline.correct_bag(
+        bag, calibration, out / CLOUD, options=options, progress=progress
+    )
+    view = view_of(read_ply(out / CLOUD), calibration.sample_period)
+    summary = summarise(bag, account, view, calibration, nominal)
+    figures = surface_figures(view, nominal) if view is not None else {}
+    publish(out, f"Surface of {bag.name}", summary, calibration, figures)
+    return summary
+
+
+def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
+    """Columns of a cloud for the report; None if it has no points.
+
+    Without the dynamic correction its height would be ``raw_height``.
+    """
+    if not len(cloud):
+        return None
+    sample = cloud["sample"].astype(np.int64)
+    error = cloud["dynamic_error"].astype(np.float64)
+    return CloudView(
+        time=(sample - sample[0]) * sample_period,
+        x=cloud["x"].astype(np.float64),
+        y=cloud["y"].astype(np.float64),
+        height=cloud["height"].astype(np.float64),
+        raw_height=cloud["height"] + error,
+        dynamic_error=error,
+        uncertainty=cloud["uncertainty"].astype(np.float64),
+    )
+
+
+def summarise(
+    bag: Path,
+    account: Mapping[str, Any],
+    view: CloudView | None,
+    calibration: Calibration,
+    nominal: Surface | None,
+) -> dict[str, Any]:
+    """What ``summary.json`` says of every measurement; lengths in metres."""
+    summary: dict[str, Any] = {
+        "schema": "omsm-summary/1",
+        "bag": str(bag),
+        "calibration": calibration.id,
+        "samples": dict(account),
+        "settings": dict(calibration.settings),
+        "versions": {
+            "omsm_ros": __version__,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
+        },
+        "files": {"cloud": CLOUD, "summary": SUMMARY, "report": REPORT},
+    }
+    if view is None:
+        return summary | {"warnings": ["not one sample could be corrected; see the reasons"]}
+    summary["uncertainty"] = {
+        "median": float(np.median(view.uncertainty)),
+        "largest": float(np.max(view.uncertainty)),
+    }
+    if nominal is not None:
+        summary["deviation"] = _deviation(view, nominal)
+    return summary
+
+
+def _deviation(view: CloudView, nominal: Surface) -> dict[str, Any]:
+    weights = form.spiral_weights(view.x, view.y)
+    heights = {"raw": view.raw_height, "corrected": view.height}
+    return {
+        name: asdict(form.statistics(form.deviation(view.x, view.y, height, nominal), weights))
+        for name, height in heights.items()
+    }
+
+
+def publish(
+    out: Path,
+    title: str,
+    summary: Mapping[str, Any],
+    calibration: Calibration,
+    figures: Mapping[str, bytes],
+) -> None:
+    """Write summary.json and report.html."""
+    save_json(out / SUMMARY, summary)
+    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    page = render(Report(title, date, summary, calibration=calibration, figures=figures))
+    with whole_file(out / REPORT, "w") as stream:
+        stream.write(page)

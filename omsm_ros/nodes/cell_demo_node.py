@@ -1,0 +1,210 @@
+"""``cell_demo``: calibrate and measure a whole (emulated) cell with the real nodes.
+
+Starts emulator, driver, calibrator, corrector and recorder as processes, has the step test
+run and identified, scans the paper's mirror, corrects the recorded bag once more offline and
+compares everything with the truth of the twin.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from omsm_msgs.srv import Identify
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from tqdm import tqdm
+
+from omsm_ros.demonstration import Demonstration, conclude, table_of
+from omsm_ros.errors import DeviceTimeoutError, OmsmError
+from omsm_ros.nodes.processes import NodeProcesses
+
+_START_TIMEOUT_S = 60.0
+_STALL_TIMEOUT_S = 60.0
+_PREFIX = "/omsm/"
+
+
+class DemoNode(Node):
+    """The operator: looks at diagnostics, presses the buttons, waits for what must come."""
+
+    def __init__(self, processes: NodeProcesses) -> None:
+        super().__init__("cell_demo", namespace="omsm")
+        self._processes = processes
+        self._status: dict[str, dict[str, str]] = {}
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self._status[status.name.removeprefix(_PREFIX)] = values | {"message": status.message}
+
+    def value(self, node: str, key: str) -> int:
+        """A count from a node's diagnostics; 0 before the first one."""
+        return int(self._status.get(node, {}).get(key, 0))
+
+    def text(self, node: str, key: str) -> str:
+        """A text from a node's diagnostics; empty before the first one."""
+        return self._status.get(node, {}).get(key, "")
+
+    def wait_until(
+        self, what: str, done: Callable[[], bool], watch: Callable[[], object] = lambda: None
+    ) -> None:
+        """Spin until ``done``; DeviceTimeoutError if ``watch`` stands still for long."""
+        last, deadline = watch(), self._deadline()
+        while not done():
+            rclpy.spin_once(self, timeout_sec=0.1)
+            self._processes.check()
+            if (now := watch()) != last:
+                last, deadline = now, self._deadline()
+            if self.get_clock().now().nanoseconds > deadline:
+                raise DeviceTimeoutError(f"waited in vain for {what}; see the logs beside the results")
+
+    def _deadline(self) -> float:
+        return self.get_clock().now().nanoseconds + _STALL_TIMEOUT_S * 1e9
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """Call a service and wait for its answer."""
+        client = self.create_client(kind, name)
+        if not client.wait_for_service(_START_TIMEOUT_S):
+            raise DeviceTimeoutError(f"service {name!r} did not appear; see the logs")
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self, future, timeout_sec=_START_TIMEOUT_S)
+        answer = future.result()
+        if answer is None or not answer.success:
+            raise OmsmError(f"{name}: {answer.message if answer else 'no answer'}")
+        return answer
+
+
+# --------------------------------------------------------------------------- the measurement
+
+
+class Stage:
+    """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
+
+    @contextmanager
+    def __call__(self, title: str, total: int = 0) -> Iterator[Callable[[int], None]]:
+        plain = not sys.stderr.isatty()
+        if plain and not self._quiet:
+            print(f"· {title}", file=sys.stderr, flush=True)
+        layout = "{desc:<44} {percentage:3.0f}% |{bar:30}| {elapsed}" if total else "{desc} {elapsed}"
+        with tqdm(
+            desc=title, total=total or None, disable=self._quiet or plain, bar_format=layout
+        ) as bar:
+            yield lambda done: bar.update(done - bar.n)
+            bar.update((total or bar.n) - bar.n)
+
+
+def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: Stage) -> None:
+    """Run the cell: step test, identification, scan, recording."""
+    with stage("starting the cell and its nodes"):
+        processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
+        processes.start("confocal_driver", port=plan.link, sample_period=plan.sample_period)
+        processes.start(
+            "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
+        )
+        processes.start("corrector")
+        node.wait_until(
+            "the driver, calibrator and corrector to find each other",
+            lambda: node.value("confocal_driver", "axes_subscribers") >= 2
+            and node.value("confocal_driver", "confocal_subscribers") >= 2,
+        )
+    steps = plan.step_test_samples
+    with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
+        node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
+        _follow(node, "calibrator", ("axes_held", "distance_held"), steps, progress)
+    with stage("identifying the transfer function from encoder to probe"):
+        answer = node.call(Identify, "/omsm/calibrator/identify", Identify.Request())
+        node.wait_until(
+            "the corrector to take the calibration",
+            lambda: node.text("corrector", "calibration") == answer.calibration.id,
+        )
+    with stage("starting the recorder"):
+        processes.start("recorder", path=str(plan.bag))
+        node.wait_until(
+            "the recorder to be heard",
+            lambda: node.value("confocal_driver", "axes_subscribers") >= 3
+            and node.value("confocal_driver", "confocal_subscribers") >= 3
+            and node.value("corrector", "points_subscribers") >= 1,
+        )
+    scan, earlier = plan.scan_samples, node.value("confocal_driver", "blocks")
+    with stage(f"scanning the mirror: {scan} points", scan) as progress:
+        node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
+        _follow(node, "corrector", ("axes_received", "distance_received"), scan, progress)
+        node.wait_until(
+            "the last clouds to be recorded",
+            lambda: node.value("recorder", "/omsm/points")
+            == node.value("corrector", "clouds_published")
+            and node.value("recorder", "/omsm/axes")
+            == node.value("recorder", "/omsm/confocal")
+            == node.value("confocal_driver", "blocks") - earlier,
+        )
+    with stage("ending the nodes"):
+        processes.end()
+
+
+def _follow(
+    node: DemoNode, who: str, counts: tuple[str, ...], total: int, progress: Callable[[int], None]
+) -> None:
+    def seen() -> int:
+        least = min(node.value(who, name) for name in counts)
+        progress(least)
+        return least
+
+    node.wait_until(f"{total} samples at the {who}", lambda: seen() >= total, seen)
+
+
+# -------------------------------------------------------------------------------- command line
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="cell_demo", description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/demo"))
+    parser.add_argument("--time-lapse", type=float, default=20.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start-radius", type=float, default=12.7e-3, help="[m]")
+    parser.add_argument("--json", action="store_true")
+    # What follows --ros-args is for rclpy, when started by `ros2 run`.
+    return parser.parse_args(rclpy.utilities.remove_ros_args(sys.argv)[1:])
+
+
+def main() -> None:
+    """Entry point of ``ros2 run omsm_ros cell_demo``."""
+    args = _arguments()
+    # A demonstration talks to its own nodes only, whatever else runs on the network.
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    plan = Demonstration(
+        args.out, seed=args.seed, time_lapse=args.time_lapse, start_radius=args.start_radius
+    )
+    stage = Stage(quiet=args.json)
+    rclpy.init()
+    try:
+        plan.prepare()
+        with NodeProcesses(plan.out / "log") as processes:
+            perform(DemoNode(processes), processes, plan, stage)
+        with stage("correcting the bag offline, comparing with the truth"):
+            summary = conclude(plan)
+    except OmsmError as err:
+        print(f"omsm demo: {err}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("omsm demo: interrupted", file=sys.stderr)
+        sys.exit(130)
+    finally:
+        rclpy.try_shutdown()
+    print(json.dumps(summary) if args.json else table_of(plan, summary))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""``corrector``: turns axes and distance into corrected surface points, as they come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omsm_msgs.msg import AxisBlock, DistanceBlock
+from omsm_msgs.msg import Calibration as CalibrationMessage
+from omsm_msgs.srv import LoadCalibration, PredictError
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+
+from omsm_ros import conversions
+from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.cloud import pack_points
+from omsm_ros.core.correct import CorrectionOptions, Corrector
+from omsm_ros.errors import OmsmError
+from omsm_ros.files import load_calibration
+from omsm_ros.nodes.running import (
+    LATCHED_QOS,
+    NAMESPACE,
+    OK,
+    SAMPLES_QOS,
+    WARN,
+    Diagnostics,
+    parameter,
+    run,
+)
+from omsm_ros.offline import predict_from
+
+_COMPLAINT_PERIOD_S = 5.0
+
+
+class CorrectorNode(Node):
+    """Publishes nothing until it has a calibration; a new one begins a new correction."""
+
+    def __init__(self) -> None:
+        super().__init__("corrector", namespace=NAMESPACE)
+        path = parameter(self, "calibration", "", "calibration file to start with; empty = wait")
+        follow = parameter(
+            self, "follow_calibrator", True, "take what appears on the calibration topic"
+        )
+        self._options = CorrectionOptions(
+            polarity=parameter(
+                self, "polarity", 1, "+1: distance falls as z rises; -1: the other way"
+            ),
+            accept_other_rate=parameter(
+                self, "accept_other_rate", False, "use a calibration of another sample rate"
+            ),
+        )
+        self._messages = conversions.ros_messages()
+        self._calibration: Calibration | None = None
+        self._corrector: Corrector | None = None
+        self._uncalibrated = {"axes": 0, "distance": 0}
+        self._refused = {"axes": 0, "distance": 0}
+        self._complaint = ""
+        self._stamp_ns = 0
+        self._published = 0
+        self._points = self.create_publisher(PointCloud2, "points", SAMPLES_QOS)
+        if path:
+            self._use(load_calibration(path))
+        if follow:
+            self.create_subscription(
+                CalibrationMessage, "calibration", self._on_calibration, LATCHED_QOS
+            )
+        self.create_subscription(AxisBlock, "axes", self._on_axes, SAMPLES_QOS)
+        self.create_subscription(DistanceBlock, "confocal", self._on_distance, SAMPLES_QOS)
+        self.create_service(LoadCalibration, "~/load_calibration", self._on_load)
+        self.create_service(PredictError, "~/predict_error", self._on_predict)
+        self._diagnostics = Diagnostics(self, self._report)
+        if not path:
+            self.get_logger().info("no calibration yet: nothing will be published")
+
+    # ------------------------------------------------------------------- calibration
+
+    def _use(self, calibration: Calibration) -> None:
+        self._publish_rest()
+        self._calibration = calibration
+        self._corrector = Corrector(calibration, self._options)
+        self.get_logger().info(f"calibration {calibration.id[:12]} in use")
+
+    def _publish_rest(self) -> None:
+        if self._corrector is not None:
+            self._publish(self._corrector.finish())
+            self.get_logger().info(f"samples so far: {self._corrector.account.as_dict()}")
+
+    def _on_calibration(self, message: CalibrationMessage) -> None:
+        try:
+            calibration = conversions.calibration(message)
+        except OmsmError as err:
+            self.get_logger().error(f"calibration refused: {err}")
+            return
+        if self._calibration is None or calibration.id != self._calibration.id:
+            self._use(calibration)
+
+    def _on_load(
+        self, request: LoadCalibration.Request, response: LoadCalibration.Response
+    ) -> LoadCalibration.Response:
+        try:
+            self._use(load_calibration(Path(request.path)))
+        except OmsmError as err:
+            response.success, response.message = False, str(err)
+        else:
+            response.success, response.message = True, "in use"
+        response.id = self._calibration.id if self._calibration else ""
+        return response
+
+    def _on_predict(
+        self, request: PredictError.Request, response: PredictError.Response
+    ) -> PredictError.Response:
+        try:
+            prediction = predict_from(
+                self._calibration, request.bag, request.z, request.sample_period
+            )
+        except OmsmError as err:
+            response.safe, response.message = False, str(err)
+            return response
+        response.peak_to_valley = prediction.peak_to_valley
+        response.rms = prediction.rms
+        response.outside_band_fraction = prediction.outside_band_fraction
+        response.safe = prediction.safe
+        response.message = prediction.message
+        return response
+
+    # ----------------------------------------------------------------------- samples
+
+    def _on_axes(self, message: AxisBlock) -> None:
+        self._stamp_ns = conversions.stamp_of(message)
+        self._take("axes", message, len(message.z))
+
+    def _on_distance(self, message: DistanceBlock) -> None:
+        self._take("distance", message, len(message.distance))
+
+    def _take(self, stream: str, message: AxisBlock | DistanceBlock, samples: int) -> None:
+        if self._corrector is None:
+            self._uncalibrated[stream] += samples
+            self._complain("samples come, but there is no calibration: call identify or load one")
+            return
+        try:
+            if stream == "axes":
+                self._corrector.push_axes(conversions.axis_block(message))
+            else:
+                self._corrector.push_distance(conversions.distance_block(message))
+        except OmsmError as err:
+            self._refused[stream] += samples
+            self._complain(f"{stream} block refused: {err}")
+            return
+        self._publish(self._corrector.take())
+
+    def _publish(self, points: object) -> None:
+        if points is None or not self.context.ok():
+            return
+        cloud = conversions.cloud_message(self._messages, pack_points(points), self._stamp_ns)
+        self._points.publish(cloud)
+        self._published += 1
+
+    def _complain(self, text: str) -> None:
+        self._complaint = text
+        self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
+
+    # -------------------------------------------------------------------- diagnostics
+
+    def _report(self) -> tuple[bytes, str, dict[str, object]]:
+        values: dict[str, object] = {
+            f"{stream}_{reason}": count
+            for reason, counts in (("uncalibrated", self._uncalibrated), ("refused", self._refused))
+            for stream, count in counts.items()
+        }
+        values["clouds_published"] = self._published
+        values["points_subscribers"] = self._points.get_subscription_count()
+        if self._corrector is None or self._calibration is None:
+            return WARN, "no calibration: nothing is published", values
+        values["calibration"] = self._calibration.id
+        for stream, account in self._corrector.account.as_dict().items():
+            counted = account.pop("counted")
+            values |= {f"{stream}_{name}": value for name, value in account.items()}
+            values |= {f"{stream}_{name}": value for name, value in counted.items()}
+        return OK, "correcting", values
+
+
+def main() -> None:
+    """Entry point of ``ros2 run omsm_ros corrector``."""
+    run(CorrectorNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""What the commands and the nodes do with a recorded bag.
+
+``bag → records → core → cloud.ply, summary.json, report.html``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros import bags
+from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.correct import CorrectionOptions, Corrector
+from omsm_ros.core.motion_record import MotionRecord, assemble
+
+from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.errors import BagError, CalibrationError
+from omsm_ros.files import PlyWriter
+
+Progress = Callable[[int, int], None]
+"""Called with messages done and messages in all."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Report to nobody."""
+
+
+def read_blocks(
+    path: Path, topics: Sequence[str], progress: Progress = no_progress
+) -> dict[str, list[Block]]:
+    """All blocks on ``topics``, by topic; BagError if one of the topics is not there."""
+    found: dict[str, list[Block]] = {topic: [] for topic in topics}
+    with bags.BagReader(path) as bag:
+        total = bag.count(topics)
+        for done, (topic, record) in enumerate(bag.records(*topics), start=1):
+            found[topic].append(record)
+            progress(done, total)
+    return found
+
+
+# ------------------------------------------------------------------------ identification
+
+
+def motion_of_bag(
+    path: Path, *, duration: float = 0.0, progress: Progress = no_progress
+) -> MotionRecord:
+    """The motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
+
+    The reference sensor is used where it was recorded.
+    """
+    topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
+    with bags.BagReader(path) as bag:
+        if any(t.topic == bags.REFERENCE_TOPIC and t.messages for t in bag.topics()):
+            topics.append(bags.REFERENCE_TOPIC)
+    blocks = read_blocks(path, topics, progress)
+    if not blocks[bags.AXES_TOPIC] or not blocks[bags.DISTANCE_TOPIC]:
+        raise BagError(f"{str(path)!r} has its topics but no samples on them; record a step test")
+    axes, distance, *reference = (_beginning(blocks[topic], duration) for topic in topics)
+    return assemble(axes, distance, *reference)  # type: ignore[arg-type]
+
+
+def _beginning(blocks: list[Block], duration: float) -> list[Block]:
+    if duration == 0 or not blocks:
+        return blocks
+    end = blocks[0].first_sample + duration / blocks[0].sample_period
+    return [block for block in blocks if block.first_sample < end]
+
+
+# ---------------------------------------------------------------------------- correction
+
+
+def correct_bag(
+    path: Path,
+    calibration: Calibration,
+    cloud: Path,
+    *,
+    options: CorrectionOptions | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, object]:
+    """Correct a bag into ``cloud`` (PLY) and return the account of its samples.
+
+    Memory does not grow with the bag. Leaves no cloud behind when it fails.
+    """
+    corrector = Corrector(calibration, options or CorrectionOptions())
+    topics = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
+    with (
+        bags.BagReader(path) as bag,
+        PlyWriter(cloud, comment=f"omsm_ros, metres, calibration {calibration.id}") as ply,
+    ):
+        total = bag.count(topics)
+        for done, (_, record) in enumerate(bag.records(*topics), start=1):
+            if isinstance(record, AxisBlock):
+                corrector.push_axes(record)
+            else:
+                corrector.push_distance(record)
+            if (points := corrector.take()) is not None:
+                ply.write(points)
+            progress(done, total)
+        if (rest := corrector.finish()) is not None:
+            ply.write(rest)
+    return dict(corrector.account.as_dict())
+
+
+# ------------------------------------------------------------------------------- preview
+
+
+def predict_from(
+    calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
+) -> "Prediction":
+    """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty."""
+    from omsm_ros.core.predict import predict_error
+
+    if calibration is None:
+        raise CalibrationError("no calibration in use; call identify or load one")
+    if bag:
+        blocks = read_blocks(Path(bag), [bags.AXES_TOPIC])[bags.AXES_TOPIC]
+        if not blocks:
+            raise BagError(f"{bag!r} has no samples on {bags.AXES_TOPIC!r}")
+        z = np.concatenate([b.z for b in blocks if isinstance(b, AxisBlock)])
+        sample_period = blocks[0].sample_period
+    return predict_error(calibration, np.asarray(z, np.float64), sample_period)
+
+
+# ---------------------------------------------------------------------------- inspection
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInspection:
+    """What a stream of blocks holds.
+
+    gaps: places where the trigger counter skips; missing: samples skipped there
+    restarts: places where it falls back
+    """
+
+    topic: str
+    type: str
+    messages: int
+    samples: int = 0
+    sample_period: float = 0.0
+    duration: float = 0.0
+    gaps: int = 0
+    missing: int = 0
+    restarts: int = 0
+    invalid: int = 0
+
+
+def inspect_bag(path: Path, progress: Progress = no_progress) -> list[StreamInspection]:
+    """Look through a bag: topics, samples, rates, gaps, restarts, invalid readings."""
+    with bags.BagReader(path) as bag:
+        topics = bag.topics()
+    streams = {bags.AXES_TOPIC, bags.DISTANCE_TOPIC, bags.REFERENCE_TOPIC, bags.ACCELERATION_TOPIC}
+    present = [t.topic for t in topics if t.topic in streams]
+    blocks = read_blocks(path, present, progress)
+    return [
+        _inspect(t, blocks[t.topic])
+        if blocks.get(t.topic)
+        else StreamInspection(t.topic, t.type, t.messages)
+        for t in topics
+    ]
+
+
+def _inspect(topic: bags.TopicSummary, blocks: list[Block]) -> StreamInspection:
+    first = np.array([b.first_sample for b in blocks])
+    length = np.array([len(b) for b in blocks])
+    skip = first[1:] - (first + length)[:-1]
+    period = blocks[0].sample_period
+    return StreamInspection(
+        topic=topic.topic,
+        type=topic.type,
+        messages=topic.messages,
+        samples=int(length.sum()),
+        sample_period=period,
+        duration=float(length.sum() * period),
+        gaps=int(np.sum(skip > 0)),
+        missing=int(skip[skip > 0].sum()),
+        restarts=int(np.sum(skip < 0)),
+        invalid=sum(int(np.sum(~b.ok)) for b in blocks if isinstance(b, DistanceBlock)),
+    )
+
+
+def as_json(inspections: list[StreamInspection]) -> list[dict[str, object]]:
+    """JSON values of an inspection."""
+    return [asdict(inspection) for inspection in inspections]
