@@ -224,9 +224,7 @@ class BagWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, so that the last step is a rename and cannot be half done.
         self._scratch = Path(tempfile.mkdtemp(prefix=f".{self.path.name}-", dir=self.path.parent))
-        self._writer = Writer(
-            self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP
-        )
+        self._writer = Writer(self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         for topic in self._topics:
             self._connections[topic] = self._writer.add_connection(

@@ -104,7 +104,9 @@ def _print_identify(facts: dict[str, Any]) -> None:
 def _print_correct(summary: dict[str, Any]) -> None:
     for stream, account in summary["samples"].items():
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
-        print(f"{stream:<9} {account['received']} received, {account['corrected']} corrected{reasons}")
+        print(
+            f"{stream:<9} {account['received']} received, {account['corrected']} corrected{reasons}"
+        )
     print(f"written   {', '.join(summary['files'].values())}")
 
 

@@ -36,9 +36,7 @@ def measure(
     progress: offline.Progress = offline.no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary."""
-    account = offline.correct_bag(
-        bag, calibration, out / CLOUD, options=options, progress=progress
-    )
+    account = offline.correct_bag(bag, calibration, out / CLOUD, options=options, progress=progress)
     view = view_of(read_ply(out / CLOUD), calibration.sample_period)
     summary = summarise(bag, account, view, calibration, nominal)
     figures = surface_figures(view, nominal) if view is not None else {}

@@ -88,7 +88,7 @@ class TransferFunction:
 
     def response(self, frequency: ArrayLike) -> ComplexArray:
         """G(2πjf) at ``frequency`` [Hz], of the same shape."""
-        return self.at(2j * np.pi * np.asarray(frequency, np.float64))
+        return self.at(np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128))
 
     def at(self, s: ComplexArray) -> ComplexArray:
         """G at complex ``s`` [rad/s], of the same shape."""

@@ -27,7 +27,7 @@ from omsm_ros.demonstration import Demonstration, conclude, table_of
 from omsm_ros.errors import DeviceTimeoutError, OmsmError
 from omsm_ros.nodes.processes import NodeProcesses
 
-_START_TIMEOUT_S = 60.0
+_SERVICE_TIMEOUT_S = 60.0
 _STALL_TIMEOUT_S = 60.0
 _PREFIX = "/omsm/"
 
@@ -65,21 +65,32 @@ class DemoNode(Node):
             if (now := watch()) != last:
                 last, deadline = now, self._deadline()
             if self.get_clock().now().nanoseconds > deadline:
-                raise DeviceTimeoutError(f"waited in vain for {what}; see the logs beside the results")
+                raise DeviceTimeoutError(
+                    f"waited in vain for {what}; see the logs beside the results"
+                )
 
     def _deadline(self) -> float:
         return self.get_clock().now().nanoseconds + _STALL_TIMEOUT_S * 1e9
 
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        """Call a service and wait for its answer."""
+    def ask(self, kind: Any, name: str, request: Any, patience: float = _SERVICE_TIMEOUT_S) -> Any:
+        """Call a service and return its answer; DeviceTimeoutError if there is none."""
         client = self.create_client(kind, name)
-        if not client.wait_for_service(_START_TIMEOUT_S):
-            raise DeviceTimeoutError(f"service {name!r} did not appear; see the logs")
-        future = client.call_async(request)
-        rclpy.spin_until_future_complete(self, future, timeout_sec=_START_TIMEOUT_S)
-        answer = future.result()
-        if answer is None or not answer.success:
-            raise OmsmError(f"{name}: {answer.message if answer else 'no answer'}")
+        try:
+            if not client.wait_for_service(patience):
+                raise DeviceTimeoutError(f"service {name!r} did not appear; see the logs")
+            future = client.call_async(request)
+            rclpy.spin_until_future_complete(self, future, timeout_sec=patience)
+            if (answer := future.result()) is None:
+                raise DeviceTimeoutError(f"service {name!r} did not answer; see the logs")
+            return answer
+        finally:
+            self.destroy_client(client)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """Call a service and return its answer; OmsmError if it did not succeed."""
+        answer = self.ask(kind, name, request)
+        if not answer.success:
+            raise OmsmError(f"{name}: {answer.message}")
         return answer
 
 
@@ -97,7 +108,9 @@ class Stage:
         plain = not sys.stderr.isatty()
         if plain and not self._quiet:
             print(f"· {title}", file=sys.stderr, flush=True)
-        layout = "{desc:<44} {percentage:3.0f}% |{bar:30}| {elapsed}" if total else "{desc} {elapsed}"
+        layout = (
+            "{desc:<44} {percentage:3.0f}% |{bar:30}| {elapsed}" if total else "{desc} {elapsed}"
+        )
         with tqdm(
             desc=title, total=total or None, disable=self._quiet or plain, bar_format=layout
         ) as bar:
@@ -116,8 +129,10 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
         processes.start("corrector")
         node.wait_until(
             "the driver, calibrator and corrector to find each other",
-            lambda: node.value("confocal_driver", "axes_subscribers") >= 2
-            and node.value("confocal_driver", "confocal_subscribers") >= 2,
+            lambda: (
+                node.value("confocal_driver", "axes_subscribers") >= 2
+                and node.value("confocal_driver", "confocal_subscribers") >= 2
+            ),
         )
     steps = plan.step_test_samples
     with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
@@ -133,9 +148,11 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
         processes.start("recorder", path=str(plan.bag))
         node.wait_until(
             "the recorder to be heard",
-            lambda: node.value("confocal_driver", "axes_subscribers") >= 3
-            and node.value("confocal_driver", "confocal_subscribers") >= 3
-            and node.value("corrector", "points_subscribers") >= 1,
+            lambda: (
+                node.value("confocal_driver", "axes_subscribers") >= 3
+                and node.value("confocal_driver", "confocal_subscribers") >= 3
+                and node.value("corrector", "points_subscribers") >= 1
+            ),
         )
     scan, earlier = plan.scan_samples, node.value("confocal_driver", "blocks")
     with stage(f"scanning the mirror: {scan} points", scan) as progress:
@@ -143,11 +160,13 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
         _follow(node, "corrector", ("axes_received", "distance_received"), scan, progress)
         node.wait_until(
             "the last clouds to be recorded",
-            lambda: node.value("recorder", "/omsm/points")
-            == node.value("corrector", "clouds_published")
-            and node.value("recorder", "/omsm/axes")
-            == node.value("recorder", "/omsm/confocal")
-            == node.value("confocal_driver", "blocks") - earlier,
+            lambda: (
+                node.value("recorder", "/omsm/points")
+                == node.value("corrector", "clouds_published")
+                and node.value("recorder", "/omsm/axes")
+                == node.value("recorder", "/omsm/confocal")
+                == node.value("confocal_driver", "blocks") - earlier
+            ),
         )
     with stage("ending the nodes"):
         processes.end()

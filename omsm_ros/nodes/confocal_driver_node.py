@@ -47,6 +47,7 @@ class ConfocalDriverNode(Node):
             transport_for(address, baud_rate), settings, lambda: self.get_clock().now().nanoseconds
         )
         self._trouble = "not connected yet"
+        self._connections = 0
         self._stop = threading.Event()
         self._diagnostics = Diagnostics(self, self._report, hardware_id=address)
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -66,6 +67,7 @@ class ConfocalDriverNode(Node):
 
     def _recovered(self) -> None:
         self._trouble = ""
+        self._connections += 1
         self.get_logger().info("connected")
 
     def _lost(self, err: DeviceError) -> None:
@@ -81,7 +83,7 @@ class ConfocalDriverNode(Node):
             self._distance.publish(conversions.distance_message(self._messages, distance))
 
     def _report(self) -> tuple[bytes, str, dict[str, object]]:
-        statistics = asdict(self._device.statistics)
+        statistics = asdict(self._device.statistics) | {"connections": self._connections}
         for name, publisher in (("axes", self._axes), ("confocal", self._distance)):
             statistics[f"{name}_subscribers"] = publisher.get_subscription_count()
         if self._trouble:

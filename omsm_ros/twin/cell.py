@@ -7,13 +7,14 @@ error motion, Abbe offsets, speckle, slope-dependent intensity, friction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from omsm_ros.core.records import AxisBlock, DistanceBlock, FloatArray, Status
 from omsm_ros.core.surface import Surface
 from omsm_ros.core.trajectory import Motion
+from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant, respond
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, NANOSECONDS_PER_S
@@ -39,6 +40,7 @@ class Cell:
     """Everything that decides what the devices report.
 
     encoder_noise: standard deviation [m];  drift: of the fixture [m/s]
+    latency: how late the probe's reading is [s]: it tells of the place it saw that long ago
     sample_period: of the common trigger [s];  seed: of all noise
     """
 
@@ -46,10 +48,13 @@ class Cell:
     probe: Probe = field(default_factory=Probe)
     encoder_noise: float = 0.4 * NANOMETRE_M
     drift: float = 0.0
+    latency: float = 0.0
     sample_period: float = 1e-3
     seed: int = 1
 
     def __post_init__(self) -> None:
+        if not 0 <= self.latency < np.inf:
+            raise ConfigurationError(f"latency {self.latency!r} s, expected zero or positive")
         if not self.sample_period > 0:
             raise ConfigurationError(f"sample_period {self.sample_period!r} s is not positive")
 
@@ -59,8 +64,8 @@ class Recording:
     """Samples as reported, one block each, and the truth behind them; arrays of shape (n,).
 
     axes, distance: what the devices say
-    probe_motion: true motion of the probe, G · X_d [m]
-    surface_height: true height of the surface under the probe [m]
+    probe_motion: true motion of the probe, G · X_d, when the reading was made [m]
+    surface_height: true height of the surface then under the probe [m]
     """
 
     axes: AxisBlock
@@ -79,11 +84,12 @@ def record(
     """
     samples = round(motion.duration / cell.sample_period)
     time = np.arange(samples) * cell.sample_period
-    moved = respond(cell.plant, motion, samples, cell.sample_period, substeps)
-    command = motion.positions(time)
+    plant = _late(cell.plant, cell.latency)
+    moved = respond(plant, motion, samples, cell.sample_period, substeps)
+    command, seen = motion.positions(time), motion.positions(time - cell.latency)
     truth = surface.height(
-        command.x * np.cos(command.c) + command.y * np.sin(command.c),
-        command.y * np.cos(command.c) - command.x * np.sin(command.c),
+        seen.x * np.cos(seen.c) + seen.y * np.sin(seen.c),
+        seen.y * np.cos(seen.c) - seen.x * np.sin(seen.c),
     )
     encoder_random, probe_random = (
         np.random.default_rng(child) for child in np.random.SeedSequence(cell.seed).spawn(2)
@@ -103,6 +109,12 @@ def record(
     return Recording(
         axes=axes, distance=distance, probe_motion=moved.probe, surface_height=truth
     )
+
+
+def _late(plant: Plant, latency: float) -> Plant:
+    g = plant.dynamics
+    late = TransferFunction(g.numerator, g.denominator, g.delay + latency)
+    return replace(plant, dynamics=late)
 
 
 def _reading(

@@ -1,0 +1,115 @@
+"""The certificate of a calibration: how it was obtained, and whether to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.hankel import HankelVote
+from omsm_ros.core.order import Candidate
+from omsm_ros.core.transfer_function import TransferFunction
+
+# A residual this much larger than the noise is not noise; its square is χ² per sample.
+_WORST_CHI_SQUARE = 1.5
+_LEAST_TRUSTED_HZ = 5.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the verdict rests on; SI units."""
+
+    chi_square: float
+    residual_rms: float
+    noise: float
+    valid_up_to: float
+    nyquist: float
+    delay_uncertainty: float
+    inter_sample_delay_bound: float
+    edges: int
+
+
+def certify(
+    dynamics: TransferFunction,
+    chosen: Candidate,
+    candidates: Sequence[Candidate],
+    vote: HankelVote,
+    evidence: Evidence,
+    further: Mapping[str, object],
+) -> dict[str, object]:
+    """A dict of JSON values, ending with ``reasons``, ``warnings`` and ``verdict``."""
+    structure = chosen.fit.structure
+    reasons, warnings = _reasons(evidence), _warnings(dynamics, evidence)
+    return {
+        "order": structure.poles,
+        "structure": _structure(chosen),
+        "singular_values": [float(v) for v in vote.singular_values],
+        "singular_value_order": vote.order,
+        "candidates": [
+            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms, "held_out_m": _number(c.held_out)}
+            for c in candidates
+        ],
+        "chi_square": evidence.chi_square,
+        "residual_rms_m": evidence.residual_rms,
+        "noise_m": evidence.noise,
+        "edges": evidence.edges,
+        "low_frequency_delay_s": dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty_s": evidence.delay_uncertainty,
+        "inter_sample_delay_bound_s": evidence.inter_sample_delay_bound,
+        "modes": [
+            {"frequency_hz": mode.frequency, "damping": mode.damping} for mode in dynamics.modes()
+        ],
+        **further,
+        "warnings": warnings,
+        "reasons": reasons,
+        "verdict": _verdict(reasons, evidence),
+    }
+
+
+def _structure(candidate: Candidate) -> dict[str, object]:
+    structure = candidate.fit.structure
+    return {"poles": structure.poles, "zeros": structure.zeros, "delay": structure.delay}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _reasons(evidence: Evidence) -> list[str]:
+    reasons = []
+    if evidence.chi_square > _WORST_CHI_SQUARE:
+        reasons.append(
+            f"the residual of {evidence.residual_rms * 1e9:.1f} nm is not the noise of "
+            f"{evidence.noise * 1e9:.1f} nm (chi-square {evidence.chi_square:.2f} per sample): "
+            "the model misses something"
+        )
+    if evidence.valid_up_to < _LEAST_TRUSTED_HZ:
+        reasons.append(
+            f"the response is known within limits only up to {evidence.valid_up_to:.2g} Hz; "
+            "make more or larger steps"
+        )
+    if evidence.inter_sample_delay_bound > 5 * max(evidence.delay_uncertainty, 0.5e-6):
+        reasons.append(
+            "motion between samples may shift the lag by "
+            f"{evidence.inter_sample_delay_bound * 1e6:.1f} µs: the edges are too sharp for the "
+            "sampling; use jerk-limited or dithered edges, or sample faster"
+        )
+    return reasons
+
+
+def _warnings(dynamics: TransferFunction, evidence: Evidence) -> list[str]:
+    return [
+        f"pole at {mode.frequency:.0f} Hz lies beyond {evidence.valid_up_to:.0f} Hz, where the "
+        "data are silent: it stands for all that is faster, not for a resonance"
+        for mode in dynamics.modes()
+        if mode.frequency > evidence.valid_up_to
+    ]
+
+
+def _verdict(reasons: list[str], evidence: Evidence) -> str:
+    if reasons:
+        return "rejected"
+    if evidence.valid_up_to < 0.999 * evidence.nyquist:
+        return f"accepted up to {evidence.valid_up_to:.0f} Hz"
+    return "accepted"

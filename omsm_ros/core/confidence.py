@@ -1,0 +1,141 @@
+"""How well an identified response is known: covariance, band, and where trust ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import fft
+
+from omsm_ros.core.output_error import Problem
+from omsm_ros.core.records import FloatArray
+from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.units import DEGREE_RAD
+
+# 95 % of a normal distribution.
+COVERAGE_FACTOR = 1.959964
+_MAX_NOISE_ORDER = 12
+# Directions of the parameter space this much weaker than the strongest are left out.
+_RANK_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseLimits:
+    """Half-widths of the 95 % band within which a response is trusted: gain [1], phase [rad]."""
+
+    gain: float = 0.01
+    phase: float = 1.0 * DEGREE_RAD
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Standard uncertainty over ``frequency`` [Hz]: relative gain [1] and phase [rad], all (k,)."""
+
+    frequency: FloatArray
+    gain: FloatArray
+    phase: FloatArray
+
+
+def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
+    """Variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies; white is flat.
+
+    An autoregression by Yule and Walker, its order by BIC; order 0 gives the plain variance.
+    """
+    n = len(residual)
+    size = fft.next_fast_len(2 * n, real=True)
+    power = np.abs(fft.rfft(residual, size)) ** 2
+    lags = fft.irfft(power, size)[: _MAX_NOISE_ORDER + 1] / n
+    if lags[0] <= 0:
+        return np.zeros(length // 2 + 1)
+    coefficients, variance = np.ones(1), float(lags[0])
+    best = (n * np.log(variance), coefficients, variance)
+    for order in range(1, _MAX_NOISE_ORDER + 1):
+        # Levinson's recursion.
+        reflection = -(coefficients @ lags[order:0:-1]) / variance
+        padded = np.append(coefficients, 0.0)
+        coefficients = padded + reflection * padded[::-1]
+        variance *= 1 - reflection**2
+        score = n * np.log(variance) + order * np.log(n)
+        if score < best[0]:
+            best = (score, coefficients, variance)
+    _, coefficients, variance = best
+    return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
+
+
+def parameter_covariance(
+    problem: Problem, columns: FloatArray, residual: FloatArray
+) -> FloatArray:
+    """(q, q) covariance of the parameters of ``columns`` (k, q), coloured residual allowed.
+
+    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
+    """
+    samples, size = columns.shape
+    residual = residual * np.sqrt(samples / max(samples - size, 1))
+    on_grid = np.zeros((len(problem.used), size))
+    on_grid[problem.used] = columns
+    length = fft.next_fast_len(len(on_grid) + _MAX_NOISE_ORDER, real=True)
+    spectrum = fft.rfft(on_grid, length, axis=0)
+    weight = np.full(len(spectrum), 2.0)
+    weight[0] = 1.0
+    if length % 2 == 0:
+        weight[-1] = 1.0
+    weighted = (weight * noise_spectrum(residual, length))[:, np.newaxis] * spectrum
+    meat = np.real(np.conj(spectrum).T @ weighted) / length
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    bread = np.linalg.pinv((columns / scale).T @ (columns / scale), _RANK_TOLERANCE, True)
+    inside = bread @ (meat / np.outer(scale, scale)) @ bread
+    covariance = inside / np.outer(scale, scale)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def delay_direction(dynamics: TransferFunction) -> FloatArray:
+    """d(numerator, denominator[1:], delay) of a small extra delay, to second order in s, (p,).
+
+    Where a structure has no delay of its own, it moves the numerator: e^{-τs} ≈ 1 - τs.
+    """
+    numerator, denominator = dynamics.numerator, dynamics.denominator
+    direction = np.zeros(len(numerator) + len(denominator))
+    if len(numerator) == 1 and len(denominator) > 1:
+        # No zero to move either: the first-order lag of the denominator takes it.
+        direction[len(numerator)] = 1.0
+    elif len(numerator) == 1:
+        direction[-1] = 1.0
+    else:
+        direction[1 : len(numerator)] = -numerator[:-1]
+    return direction
+
+
+def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray) -> FloatArray:
+    """d(ln|G|, arg G)/d(numerator, denominator[1:], delay) at ``frequency`` (k,), shape (2, k, p)."""
+    s = 2j * np.pi * np.asarray(frequency, np.float64)[:, np.newaxis]
+    up = s ** np.arange(len(dynamics.numerator)) / polynomial.polyval(s, dynamics.numerator)
+    powers = np.arange(1, len(dynamics.denominator))
+    down = -(s**powers) / polynomial.polyval(s, dynamics.denominator)
+    both = np.concatenate([up, down, -s], axis=1)
+    return np.stack([both.real, both.imag])
+
+
+def response_band(
+    dynamics: TransferFunction, covariance: FloatArray, frequency: FloatArray
+) -> Band:
+    """Standard uncertainty of gain and phase from the covariance of the coefficients (p, p)."""
+    jacobian = relative_response_jacobian(dynamics, frequency)
+    variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
+    gain, phase = np.sqrt(np.maximum(variance, 0.0))
+    return Band(np.asarray(frequency, np.float64), gain, phase)
+
+
+def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None) -> float:
+    """Highest frequency [Hz] below which the 95 % band stays inside ``limits``; 0 if nowhere.
+
+    other: further error at the same frequencies, added to the half-width, or None
+    """
+    gain, phase = COVERAGE_FACTOR * band.gain, COVERAGE_FACTOR * band.phase
+    if other is not None:
+        gain, phase = gain + other.gain, phase + other.phase
+    outside = np.flatnonzero((gain > limits.gain) | (phase > limits.phase))
+    if len(outside) == 0:
+        return float(band.frequency[-1])
+    return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0

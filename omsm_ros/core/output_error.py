@@ -1,0 +1,224 @@
+"""Fit G(s) to a motion and what the probe saw of it, by the error of the output.
+
+The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
+``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is
+exact for any G and any delay as long as the encoder has nothing beyond half the sampling
+rate; what an edge may hide there is bounded by :mod:`omsm_ros.core.inter_sample`.
+Model and data are compared in time, so a missing sample is simply not compared.
+Gain, offset and drift enter linearly and are eliminated (variable projection, Golub and
+Pereyra 1973, with Kaufman's simplification of the derivative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import fft, optimize
+
+from omsm_ros.core.records import BoolArray, FloatArray
+from omsm_ros.core.structure import Scaled, Structure
+from omsm_ros.core.trajectory import s_curve
+from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
+
+# Long enough that a bridge across the whole travel adds nothing near the fastest motion.
+_BRIDGE_S = 0.3
+_MIN_BRIDGE_SAMPLES = 64
+_RANK_TOLERANCE = 1e-12
+_RACE_EVALUATIONS = 5
+_FINISH_EVALUATIONS = 60
+
+
+def close_period(motion: FloatArray, period: float) -> FloatArray:
+    """``motion`` (n,) followed by a smooth way back to its start, of a length quick to transform."""
+    bridge = max(round(_BRIDGE_S / period), _MIN_BRIDGE_SAMPLES)
+    total = fft.next_fast_len(len(motion) + bridge, real=True)
+    phase = np.arange(1, total - len(motion) + 1) / (total - len(motion) + 1)
+    way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
+    return np.concatenate([motion, way_back])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted: ``seen`` (n,) where ``used`` (n,), from ``motion`` (n,), plus ``background``.
+
+    background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
+    rate: [rad/s] unit of s inside the fit
+    """
+
+    motion: FloatArray
+    seen: FloatArray
+    used: BoolArray
+    period: float
+    background: FloatArray
+    rate: float
+
+    @cached_property
+    def _closed_length(self) -> int:
+        return len(close_period(self.motion, self.period))
+
+    @cached_property
+    def _spectrum(self) -> ComplexArray:
+        return np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
+
+    @cached_property
+    def _s(self) -> ComplexArray:
+        omega = 2 * np.pi * fft.rfftfreq(self._closed_length, self.period)
+        return np.asarray(1j * omega / self.rate, np.complex128)
+
+    def scaled_frequencies(self) -> ComplexArray:
+        """jω / rate of the transform of the closed motion, (k,)."""
+        return self._s
+
+    @cached_property
+    def _target(self) -> FloatArray:
+        return self.seen[self.used]
+
+    @cached_property
+    def _fixed(self) -> FloatArray:
+        return self.background[self.used]
+
+    def _in_time(self, spectrum: ComplexArray) -> FloatArray:
+        back = fft.irfft(spectrum, self._closed_length, axis=-1)
+        return np.asarray(back[..., : len(self.motion)][..., self.used], np.float64)
+
+    def filtered(self, response: ComplexArray) -> FloatArray:
+        """The motion through ``response`` where it is used, and any leading axes."""
+        return self._in_time(response * self._spectrum)
+
+    def project(self, scaled: Scaled, shape: FloatArray) -> Projection:
+        """Residual and its derivative by ψ after the linear parameters are eliminated."""
+        lag, relative = scaled.lag(shape, self._s)
+        powers = self._s ** np.arange(scaled.structure.zeros + 1)[:, np.newaxis]
+        columns = np.column_stack([self.filtered(powers * lag).T, self._fixed])
+        basis, triangle = np.linalg.qr(columns)
+        linear = _solve(triangle, basis.T @ self._target)
+        residual = self._target - columns @ linear
+        response = (linear[: len(powers)] @ powers) * lag
+        moved = self.filtered(relative * response).T
+        jacobian = basis @ (basis.T @ moved) - moved
+        return Projection(residual, jacobian, linear)
+
+    def sensitivity(self, fitted: Fit) -> FloatArray:
+        """-d residual / d(numerator[1:], ψ, gain, background) at a fit, shape (k, m + len ψ + 1 + q)."""
+        scaled = fitted.scaled
+        lag, relative = scaled.lag(fitted.shape, self._s)
+        powers = self._s ** np.arange(scaled.structure.zeros + 1)[:, np.newaxis]
+        response = (fitted.numerator @ powers) * lag
+        by_dynamics = self.filtered(np.concatenate([powers[1:] * lag, relative * response])).T
+        return np.column_stack(
+            [fitted.gain * by_dynamics, self.filtered(response), self._fixed]
+        )
+
+
+def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares with a triangle that may be singular to rounding."""
+    scale = np.linalg.norm(triangle, axis=0)
+    scale[scale == 0] = 1.0
+    scaled = np.linalg.lstsq(triangle / scale, right, rcond=_RANK_TOLERANCE)[0]
+    return np.asarray(scaled / scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """At one ψ: residual (k,), jacobian (k, len ψ), linear parameters (m + 1 + q,)."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    linear: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted structure.
+
+    shape: ψ;  numerator: scaled, (m+1,), numerator[0] = 1;  gain: of the probe per motion
+    background: coefficients (q,);  residual: (k,) [m]
+    """
+
+    scaled: Scaled
+    shape: FloatArray
+    numerator: FloatArray
+    gain: float
+    background: FloatArray
+    residual: FloatArray
+
+    @property
+    def structure(self) -> Structure:
+        return self.scaled.structure
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return len(self.residual)
+
+    @property
+    def sum_of_squares(self) -> float:
+        """[m²]"""
+        return float(self.residual @ self.residual)
+
+    @property
+    def rms(self) -> float:
+        """Of the residual [m]."""
+        return float(np.sqrt(self.sum_of_squares / self.samples))
+
+    @property
+    def dynamics(self) -> TransferFunction:
+        """G(s) with G(0) = 1."""
+        return self.scaled.transfer_function(self.shape, self.numerator)
+
+
+class _Cache:
+    """Residual and jacobian of one ψ come from the same transform; compute it once."""
+
+    def __init__(self, problem: Problem, scaled: Scaled) -> None:
+        self._problem, self._scaled = problem, scaled
+        self._shape: FloatArray | None = None
+        self._value: Projection | None = None
+
+    def at(self, shape: FloatArray) -> Projection:
+        if self._value is None or self._shape is None or not np.array_equal(shape, self._shape):
+            self._value = self._problem.project(self._scaled, shape)
+            self._shape = shape.copy()
+        return self._value
+
+
+def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
+    """The best local minimum from ``starts``, each a ψ; all race, the best of them finishes."""
+    scaled = Scaled(structure, problem.rate)
+    cache = _Cache(problem, scaled)
+    best, best_cost = starts[0], np.inf
+    for start in starts:
+        shape = _descend(cache, scaled, start, _RACE_EVALUATIONS) if len(start) else start
+        cost = float(np.sum(cache.at(shape).residual ** 2))
+        if cost < best_cost:
+            best, best_cost = shape, cost
+    if len(best):
+        best = _descend(cache, scaled, best, _FINISH_EVALUATIONS)
+    at = cache.at(best)
+    zeros = structure.zeros
+    gain = float(at.linear[0])
+    return Fit(
+        scaled, best, at.linear[: zeros + 1] / gain, gain, at.linear[zeros + 1 :], at.residual
+    )
+
+
+def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int) -> FloatArray:
+    lower, upper = scaled.bounds()
+    inside = np.clip(start, lower + 1e-6, upper - 1e-6)
+    size = float(np.linalg.norm(cache.at(inside).residual)) or 1.0
+    solution = optimize.least_squares(
+        lambda shape: cache.at(shape).residual / size,
+        inside,
+        jac=lambda shape: cache.at(shape).jacobian / size,
+        bounds=(lower, upper),
+        x_scale="jac",
+        # χ² that changes by less than this much is converged.
+        ftol=1e-4 / len(cache.at(inside).residual),
+        xtol=1e-9,
+        gtol=1e-15,
+        max_nfev=evaluations,
+    )
+    return np.asarray(solution.x)

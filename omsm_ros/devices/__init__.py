@@ -1,0 +1,1 @@
+"""Devices: a transport that moves bytes, and one class a model that turns them into blocks."""

@@ -1,0 +1,169 @@
+"""Bytes to and from a device: serial port or TCP, the only module that opens either.
+
+Constructors touch nothing. A lost connection raises ``DeviceError``; ``open`` again connects
+anew.
+"""
+
+from __future__ import annotations
+
+import socket
+import termios
+from typing import Protocol
+
+import serial
+
+from omsm_ros.errors import ConfigurationError, DeviceError
+
+DEFAULT_BAUD_RATE = 921_600
+_CHUNK_BYTES = 65_536
+_TCP_SCHEME = "tcp://"
+
+
+class Transport(Protocol):
+    """A byte stream with a name to put into messages."""
+
+    @property
+    def name(self) -> str: ...
+
+    def open(self) -> None:
+        """Connect; raises DeviceError."""
+
+    def read(self, timeout: float) -> bytes:
+        """What has arrived, waiting up to ``timeout`` [s] for the first byte; b"" if none came.
+
+        Raises DeviceError when the connection is lost.
+        """
+
+    def write(self, data: bytes) -> None:
+        """Send all of ``data``; raises DeviceError."""
+
+    def close(self) -> None:
+        """Disconnect; does nothing when not connected."""
+
+
+class SerialTransport:
+    """A serial port 8N1, real or pseudo-terminal, held exclusively.
+
+    Opening discards what the port received before.
+    """
+
+    def __init__(self, port: str, baud_rate: int = DEFAULT_BAUD_RATE) -> None:
+        if not baud_rate > 0:
+            raise ConfigurationError(f"baud_rate {baud_rate!r}, expected a positive number")
+        self.name = port
+        self._baud_rate = baud_rate
+        self._port: serial.Serial | None = None
+
+    def open(self) -> None:
+        self.close()
+        try:
+            self._port = serial.Serial(self.name, self._baud_rate, exclusive=True)
+        except (OSError, ValueError, termios.error) as err:
+            raise DeviceError(
+                f"cannot open serial port {self.name!r} at {self._baud_rate!r} baud: {err}; check "
+                "the cable, the port's name, membership of group dialout, and that no other "
+                "program holds it"
+            ) from err
+
+    def read(self, timeout: float) -> bytes:
+        port = self._connected()
+        try:
+            if port.timeout != timeout:
+                port.timeout = timeout  # costs a system call, so only when it changes
+            first: bytes = port.read(1)
+            return first + port.read(min(port.in_waiting, _CHUNK_BYTES)) if first else b""
+        except (OSError, termios.error) as err:
+            raise self._lost(err) from err
+
+    def write(self, data: bytes) -> None:
+        port = self._connected()
+        try:
+            port.write(data)
+        except (OSError, termios.error) as err:
+            raise self._lost(err) from err
+
+    def close(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _connected(self) -> serial.Serial:
+        if self._port is None:
+            raise DeviceError(f"serial port {self.name!r} is not open; call open() first")
+        return self._port
+
+    def _lost(self, err: Exception) -> DeviceError:
+        return DeviceError(
+            f"serial port {self.name!r} was lost: {err}; check cable and power, then open again"
+        )
+
+
+class TcpTransport:
+    """A TCP client connection."""
+
+    def __init__(self, host: str, port: int, connect_timeout: float = 5.0) -> None:
+        if not 0 < port < 2**16:
+            raise ConfigurationError(f"TCP port {port!r}, expected 1 to 65535")
+        self.name = f"{_TCP_SCHEME}{host}:{port}"
+        self._address = (host, port)
+        self._connect_timeout = connect_timeout
+        self._socket: socket.socket | None = None
+
+    def open(self) -> None:
+        self.close()
+        try:
+            connection = socket.create_connection(self._address, self._connect_timeout)
+        except OSError as err:
+            raise DeviceError(
+                f"cannot connect to {self.name!r} within {self._connect_timeout!r} s: {err}; "
+                "check address, network and power"
+            ) from err
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connection
+
+    def read(self, timeout: float) -> bytes:
+        connection = self._connected()
+        try:
+            connection.settimeout(timeout)
+            data = connection.recv(_CHUNK_BYTES)
+        except (TimeoutError, BlockingIOError):
+            return b""
+        except OSError as err:
+            raise self._lost(str(err)) from err
+        if not data:
+            raise self._lost("closed by the device")
+        return data
+
+    def write(self, data: bytes) -> None:
+        connection = self._connected()
+        try:
+            connection.settimeout(self._connect_timeout)
+            connection.sendall(data)
+        except OSError as err:
+            raise self._lost(str(err)) from err
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _connected(self) -> socket.socket:
+        if self._socket is None:
+            raise DeviceError(f"{self.name!r} is not open; call open() first")
+        return self._socket
+
+    def _lost(self, reason: str) -> DeviceError:
+        return DeviceError(
+            f"connection to {self.name!r} was lost: {reason}; check network and power, then "
+            "open again"
+        )
+
+
+def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport:
+    """The transport that ``address`` names: ``tcp://host:port``, or the path of a serial port."""
+    if not address.startswith(_TCP_SCHEME):
+        return SerialTransport(address, baud_rate)
+    host, _, port = address[len(_TCP_SCHEME) :].rpartition(":")
+    if not (host and port.isdecimal()):
+        raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
+    return TcpTransport(host.strip("[]"), int(port))

@@ -1,0 +1,1 @@
+"""A measurement for people: figures and one self-contained HTML page."""

@@ -1,0 +1,56 @@
+"""Real nodes as processes, real DDS, a pseudo-terminal; on this machine and a domain of its own."""
+
+import os
+import time
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ros():
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(102 + os.getpid() % 100)
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """Start nodes, look at their diagnostics, call their services; all end with the test."""
+    from omsm_ros.nodes.cell_demo_node import DemoNode
+    from omsm_ros.nodes.processes import NodeProcesses
+
+    class Cell:
+        link = str(tmp_path / "port")
+        folder = tmp_path
+
+        def __init__(self, processes):
+            self.processes = processes
+            self.operator = DemoNode(processes)
+
+        def start_emulator(self, **parameters):
+            given = {"link": self.link, "time_lapse": 20.0, "start_radius": 1e-3, "seed": 3}
+            self.processes.start("cell_emulator", **(given | parameters))
+
+        def call(self, kind, name, **fields):
+            return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
+
+        def wait(self, what, done):
+            self.operator.wait_until(what, done)
+
+        def settle(self, node, key):
+            """Wait until a count has stood still for a second and return it."""
+            last, since = -1, time.monotonic()
+            while time.monotonic() - since < 1.5:
+                rclpy.spin_once(self.operator, timeout_sec=0.1)
+                if (now := self.operator.value(node, key)) != last:
+                    last, since = now, time.monotonic()
+            return last
+
+    with NodeProcesses(tmp_path / "log") as processes:
+        made = Cell(processes)
+        yield made
+        made.operator.destroy_node()
