@@ -221,9 +221,13 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        # In the same folder, so that the last step is a rename and cannot be half done.
-        self._scratch = Path(tempfile.mkdtemp(prefix=f".{self.path.name}-", dir=self.path.parent))
+        folder = self.path.parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # In the same folder, so that the last step is a rename and cannot be half done.
+            self._scratch = Path(tempfile.mkdtemp(prefix=f".{self.path.name}-", dir=folder))
+        except OSError as err:
+            raise BagError(f"cannot write {str(self.path)!r}: {err.strerror or err}") from err
         self._writer = Writer(self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         for topic in self._topics:

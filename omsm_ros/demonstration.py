@@ -21,7 +21,6 @@ from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
 from omsm_ros.files import load_calibration, read_ply
-from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report import response_figures, style
 from omsm_ros.report.gallery import surface_figures
 from omsm_ros.twin.cell import Probe, Recording

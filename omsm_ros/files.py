@@ -47,12 +47,19 @@ _CALIBRATION_SCHEMA["required"] = list(_CALIBRATION_SCHEMA["properties"])  # typ
 
 @contextmanager
 def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open ``path`` for writing under a temporary name; rename it when all went well."""
+    """Open ``path`` for writing under a temporary name; rename it when all went well.
+
+    FileError if it cannot be written there.
+    """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(f".{target.name}.part")
     try:
-        with part.open(mode) as stream:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        stream = part.open(mode)
+    except OSError as err:
+        raise FileError(f"cannot write {str(target)!r}: {err.strerror or err}") from err
+    try:
+        with stream:
             yield stream
         os.replace(part, target)
     finally:
@@ -115,16 +122,17 @@ def _no_constant(name: str) -> float:
 # --------------------------------------------------------------------------------- cloud
 
 
+_PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
+_PLY_HEADER_BYTES = 512
+_PLY_DTYPE = np.dtype(list(CLOUD_FIELDS))
+
+
 class PlyWriter:
     """Streams points into a binary ``cloud.ply`` of the contract's fields.
 
     Memory does not depend on the number of points: the header is written last, into the
     room kept for it. Leaving by an exception leaves no file.
     """
-
-    _PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
-    _HEADER_BYTES = 512
-    _DTYPE = np.dtype(list(CLOUD_FIELDS))
 
     def __init__(self, path: Path | str, comment: str = "") -> None:
         self._file = whole_file(path)
@@ -139,16 +147,16 @@ class PlyWriter:
 
     def write(self, points: SurfacePoints) -> None:
         """Append points."""
-        packed = pack_points(points).astype(self._DTYPE)
+        packed = pack_points(points).astype(_PLY_DTYPE)
         self._stream.write(packed.tobytes())
         self.points += len(packed)
 
     def _header(self) -> bytes:
         lines = ["ply", "format binary_little_endian 1.0", f"comment {self._comment}"]
         lines += [f"element vertex {self.points}"]
-        lines += [f"property {self._PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
+        lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
         text = "\n".join(lines) + "\n"
-        padding = self._HEADER_BYTES - len(text) - len("comment \nend_header\n")
+        padding = _PLY_HEADER_BYTES - len(text) - len("comment \nend_header\n")
         return f"{text}comment {' ' * padding}\nend_header\n".encode("ascii", "replace")
 
     def __exit__(
@@ -173,10 +181,9 @@ def read_ply(path: Path | str) -> NDArray[np.void]:
         (int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element vertex")),
         -1,
     )
-    dtype = np.dtype(list(CLOUD_FIELDS))
-    if count < 0 or len(body) != count * dtype.itemsize:
+    if count < 0 or len(body) != count * _PLY_DTYPE.itemsize:
         raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
-    return np.frombuffer(body, dtype)
+    return np.frombuffer(body, _PLY_DTYPE)
 
 
 # --------------------------------------------------------------------- surface, summary

@@ -15,7 +15,7 @@ from omsm_ros import bags
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.correct import CorrectionOptions, Corrector
 from omsm_ros.core.motion_record import MotionRecord, assemble
-
+from omsm_ros.core.predict import Prediction, predict_error
 from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.files import PlyWriter
@@ -109,9 +109,8 @@ def correct_bag(
 
 def predict_from(
     calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
-) -> "Prediction":
+) -> Prediction:
     """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty."""
-    from omsm_ros.core.predict import predict_error
 
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")

@@ -22,9 +22,11 @@ from omsm_ros.nodes.running import (
     parameter,
     run,
 )
+from omsm_ros.protocols.generic_stream import AXES, AxisScaling, ProbeScaling, StreamScaling
 
 _READ_TIMEOUT_S = 0.05
 _RECONNECT_S = 0.5
+_FAULTS = ("bad", "lost", "restarts", "period_warnings", "unknown_status")
 
 
 class ConfocalDriverNode(Node):
@@ -39,6 +41,7 @@ class ConfocalDriverNode(Node):
         settings = StreamSettings(
             sample_period=parameter(self, "sample_period", 1e-3, "of the trigger [s]"),
             block_size=parameter(self, "block_size", 100, "samples in a message"),
+            scaling=self._scaling(),
         )
         self._messages = conversions.ros_messages()
         self._axes = self.create_publisher(AxisBlock, "axes", SAMPLES_QOS)
@@ -52,6 +55,30 @@ class ConfocalDriverNode(Node):
         self._diagnostics = Diagnostics(self, self._report, hardware_id=address)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    def _scaling(self) -> StreamScaling:
+        usual = StreamScaling()
+        axes = {
+            name: AxisScaling(
+                parameter(self, f"{name}.counts_per_unit", axis.counts_per_unit, "per m or rad"),
+                sign=parameter(self, f"{name}.sign", axis.sign, "+1 or -1"),
+                offset=parameter(self, f"{name}.offset", axis.offset, "at zero counts [m, rad]"),
+                wrap=parameter(
+                    self, f"{name}.wrap", axis.wrap, "counts at which it wraps; 0 = never"
+                ),
+            )
+            for name in AXES
+            for axis in [getattr(usual, name)]
+        }
+        probe = ProbeScaling(
+            full_scale=parameter(
+                self, "probe.full_scale", usual.probe.full_scale, "measuring range [m]"
+            ),
+            polarity=parameter(
+                self, "probe.polarity", usual.probe.polarity, "+1: falls as z rises; -1: reversed"
+            ),
+        )
+        return StreamScaling(**axes, probe=probe)
 
     def _read(self) -> None:
         while not self._stop.is_set():
@@ -88,8 +115,8 @@ class ConfocalDriverNode(Node):
             statistics[f"{name}_subscribers"] = publisher.get_subscription_count()
         if self._trouble:
             return ERROR, self._trouble, statistics
-        faults = [k for k, v in statistics.items() if k.startswith(("bad", "lost")) and v]
-        return (WARN, f"seen: {', '.join(faults)}", statistics) if faults else (OK, "", statistics)
+        seen = [key for key in statistics if key.startswith(_FAULTS) and statistics[key]]
+        return (WARN, f"seen: {', '.join(seen)}", statistics) if seen else (OK, "", statistics)
 
     def close(self) -> None:
         """End the reading thread."""
