@@ -1,0 +1,50 @@
+"""The shipped YAML files name exactly the parameters that the nodes declare."""
+
+import ast
+from pathlib import Path
+
+import pytest
+import yaml
+
+import omsm_ros
+from omsm_ros.files import load_surface
+
+ROOT = Path(omsm_ros.__file__).resolve().parent.parent
+NODES = sorted(path.stem for path in (ROOT / "config").glob("*.yaml") if path.stem != "paper_mirror")
+
+
+def _declared(node):
+    tree = ast.parse((ROOT / "omsm_ros" / "nodes" / f"{node}_node.py").read_text())
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "parameter":
+            name = call.args[1]
+            if isinstance(name, ast.Constant):
+                yield name.value
+            else:  # f"{axis}.counts_per_unit"
+                yield from (f"{axis}{name.values[1].value}" for axis in "xyzbc")
+
+
+def _flat(values, prefix=""):
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_every_parameter_stands_in_the_yaml(node):
+    (key, content), = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text()).items()
+    assert key == f"/omsm/{node}"
+    assert sorted(_flat(content["ros__parameters"])) == sorted(_declared(node))
+
+
+def test_every_node_with_parameters_has_its_yaml():
+    nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
+    assert {node for node in nodes if list(_declared(node))} == set(NODES)
+
+
+def test_shipped_surface_is_the_papers():
+    from omsm_ros.core.surface import PAPER_MIRROR
+
+    assert load_surface(ROOT / "config" / "paper_mirror.yaml") == PAPER_MIRROR
