@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import TypeAlias
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.msg import Calibration as CalibrationMessage
@@ -14,6 +16,7 @@ from omsm_ros import conversions
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.cloud import pack_points
 from omsm_ros.core.correct import CorrectionOptions, Corrector
+from omsm_ros.core.load import LoadMeter
 from omsm_ros.errors import OmsmError
 from omsm_ros.files import load_calibration
 from omsm_ros.nodes.running import (
@@ -27,6 +30,8 @@ from omsm_ros.nodes.running import (
     run,
 )
 from omsm_ros.offline import predict_from
+
+MessageInfo: TypeAlias = "dict[str, int]"
 
 _COMPLAINT_PERIOD_S = 5.0
 
@@ -54,6 +59,7 @@ class CorrectorNode(Node):
         self._uncalibrated = {"axes": 0, "distance": 0}
         self._refused = {"axes": 0, "distance": 0}
         self._complaint = ""
+        self._load = LoadMeter()
         self._stamp_ns = 0
         self._published = 0
         self._points = self.create_publisher(PointCloud2, "points", SAMPLES_QOS)
@@ -124,14 +130,16 @@ class CorrectorNode(Node):
 
     # ----------------------------------------------------------------------- samples
 
-    def _on_axes(self, message: AxisBlock) -> None:
+    def _on_axes(self, message: AxisBlock, info: MessageInfo) -> None:
         self._stamp_ns = conversions.stamp_of(message)
-        self._take("axes", message, len(message.z))
+        self._take("axes", message, len(message.z), info)
 
-    def _on_distance(self, message: DistanceBlock) -> None:
-        self._take("distance", message, len(message.distance))
+    def _on_distance(self, message: DistanceBlock, info: MessageInfo) -> None:
+        self._take("distance", message, len(message.distance), info)
 
-    def _take(self, stream: str, message: AxisBlock | DistanceBlock, samples: int) -> None:
+    def _take(
+        self, stream: str, message: AxisBlock | DistanceBlock, samples: int, info: MessageInfo
+    ) -> None:
         if self._corrector is None:
             self._uncalibrated[stream] += samples
             self._complain("samples come, but there is no calibration: call identify or load one")
@@ -145,7 +153,9 @@ class CorrectorNode(Node):
             self._refused[stream] += samples
             self._complain(f"{stream} block refused: {err}")
             return
-        self._publish(self._corrector.take())
+        if (points := self._corrector.take()) is not None:
+            self._publish(points)
+            self._load.block(info["received_timestamp"], time.time_ns())
 
     def _publish(self, points: object) -> None:
         if points is None or not self.context.ok():
@@ -171,6 +181,7 @@ class CorrectorNode(Node):
         if self._corrector is None or self._calibration is None:
             return WARN, "no calibration: nothing is published", values
         values["calibration"] = self._calibration.id
+        values |= self._load.report(time.process_time(), time.monotonic())
         for stream, account in self._corrector.account.as_dict().items():
             counted = account.pop("counted")
             values |= {f"{stream}_{name}": value for name, value in account.items()}

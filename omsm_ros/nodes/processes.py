@@ -38,6 +38,10 @@ class NodeProcesses:
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
 
+    def pid(self, node: str) -> int:
+        """Process number of a running node."""
+        return self._running[node].pid
+
     def check(self) -> None:
         """OmsmError with the last words of a node that ended by itself."""
         for name, process in self._running.items():

@@ -1,0 +1,164 @@
+"""The corrector node alone in its process, fed over DDS at the rates of real probes."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.row import Row, at_least, at_most
+from omsm_ros import conversions
+from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.records import AxisBlock, DistanceBlock
+from omsm_ros.files import save_calibration
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+
+# One turn of the spindle at 30 rpm: the blocks of a turn are published over and over.
+TURN_S = 2.0
+
+
+def _turn(rate: float, size: int) -> list[tuple[AxisBlock, DistanceBlock]]:
+    """Blocks of one turn: astigmatic motion of half a millimetre, a microscopic distance."""
+    random = np.random.default_rng(0)
+    blocks = []
+    for first in range(0, round(TURN_S * rate), size):
+        angle = 2 * np.pi * np.arange(first, first + size) / (TURN_S * rate)
+        common = {"stamp_ns": 0, "first_sample": first, "sample_period": 1 / rate}
+        zero = np.zeros(size)
+        axes = AxisBlock(
+            **common, x=zero + 0.01, y=zero, z=0.5e-3 * np.cos(2 * angle), b=zero, c=angle
+        )
+        distance = random.normal(0.0, 1e-8, size)
+        blocks.append((axes, DistanceBlock(**common, distance=distance)))
+    return blocks
+
+
+def _calibration(path: Path, rate: float) -> None:
+    dynamics = Plant().dynamics
+    p = len(dynamics.numerator) + len(dynamics.denominator)
+    covariance = np.diag(
+        np.r_[0.0, (1e-3 * np.r_[dynamics.numerator[1:], dynamics.denominator[1:]]) ** 2, 0.0]
+    )
+    assert covariance.shape == (p, p)
+    save_calibration(
+        path,
+        Calibration(
+            dynamics=dynamics,
+            static_gain=PAPER_STATIC_GAIN,
+            sample_period=1 / rate,
+            valid_up_to=100.0,
+            covariance=covariance,
+            certificate={"verdict": "accepted", "noise_m": 1e-8},
+        ),
+    )
+
+
+def feed(rate: float, size: int, duration: float) -> dict[str, float]:
+    """Feed the corrector for ``duration`` [s] and return what its diagnostics say at the end."""
+    import rclpy
+    from omsm_msgs import msg
+
+    from omsm_ros.nodes.cell_demo_node import DemoNode
+    from omsm_ros.nodes.processes import NodeProcesses
+    from omsm_ros.nodes.running import SAMPLES_QOS
+
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    folder = Path(tempfile.mkdtemp())
+    _calibration(folder / "cal.json", rate)
+    messages = conversions.ros_messages()
+    turn = [
+        (conversions.axis_message(messages, a), conversions.distance_message(messages, d))
+        for a, d in _turn(rate, size)
+    ]
+    rclpy.init()
+    with NodeProcesses(folder) as processes:
+        node = DemoNode(processes)
+        axes = node.create_publisher(msg.AxisBlock, "axes", SAMPLES_QOS)
+        distance = node.create_publisher(msg.DistanceBlock, "confocal", SAMPLES_QOS)
+        processes.start("corrector", calibration=str(folder / "cal.json"))
+        node.wait_until(
+            "the corrector",
+            lambda: axes.get_subscription_count() and distance.get_subscription_count(),
+        )
+        sent, used = 0, _processor_time(processes.pid("corrector"))
+        start = time.monotonic()
+        blocks = round(duration * rate / size)
+        for number in range(blocks):
+            due = start + number * size / rate
+            while (wait := due - time.monotonic()) > 0:
+                time.sleep(wait)
+            stamp = node.get_clock().now().to_msg()
+            for publisher, message in zip((axes, distance), turn[number % len(turn)], strict=True):
+                message.header.stamp = stamp
+                message.first_sample = sent
+                publisher.publish(message)
+            sent += size
+            if number % 20 == 0:
+                rclpy.spin_once(node, timeout_sec=0)
+        spent = time.monotonic() - start
+        node.wait_until(
+            "the last block",
+            lambda: node.value("corrector", "axes_received") >= sent,
+            lambda: node.value("corrector", "axes_received"),
+        )
+        found = {
+            key: float(node.text("corrector", key))
+            for key in ("latency_p99_ms", "latency_max_ms", "latency_median_ms")
+        }
+        used = _processor_time(processes.pid("corrector")) - used
+        received = min(node.value("corrector", f"{s}_received") for s in ("axes", "distance"))
+        corrected = node.value("corrector", "distance_corrected")
+        settling = node.value("corrector", "distance_settling")
+        node.destroy_node()
+    rclpy.try_shutdown()
+    return found | {
+        "sent": sent,
+        "lost": sent - received,
+        "uncorrected": sent - corrected - settling,
+        "cpu": used / spent,
+        "late": spent - duration,
+    }
+
+
+def _processor_time(pid: int) -> float:
+    """User and system time of a process [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def rows(quick: bool = False) -> list[Row]:
+    """1 kHz, 70 kHz and the highest rate without loss."""
+    slow = feed(1e3, 100, 10.0 if quick else 60.0)
+    fast = feed(70e3, 700, 10.0 if quick else 300.0)
+    found = [
+        at_most("corrector, 1 kHz: share of a core", slow["cpu"], "1", 0.10, "one core"),
+        at_most("corrector, 1 kHz: samples lost", slow["lost"] + slow["uncorrected"], "1", 0),
+        at_most("corrector, 70 kHz: samples lost", fast["lost"] + fast["uncorrected"], "1", 0),
+        at_most("corrector, 70 kHz: latency p99", fast["latency_p99_ms"], "ms", 20.0),
+        at_most("corrector, 70 kHz: share of a core", fast["cpu"], "1", 1.0, "one core"),
+    ]
+    return [*found, at_least("corrector: highest rate without loss", _highest(), "Hz", 70e3)]
+
+
+def _highest() -> float:
+    best = 0.0
+    for rate in (100e3, 200e3, 400e3, 600e3, 800e3, 1.2e6):
+        seen = feed(rate, round(rate / 100), 10.0)
+        if (
+            seen["lost"]
+            or seen["uncorrected"]
+            or seen["late"] > 0.5
+            or seen["latency_p99_ms"] > 100
+        ):
+            break
+        best = rate
+    return best
+
+
+if __name__ == "__main__":
+    for row in rows(quick=True):
+        print(row)

@@ -1,0 +1,41 @@
+"""How fast does a node keep up? Latency of its blocks and its share of a processor."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from omsm_ros.units import MILLISECOND_S, NANOSECOND_S
+
+
+class LoadMeter:
+    """Latencies of the last ``window`` blocks, and processor time between two reports.
+
+    All times come from the caller; this only counts.
+    """
+
+    def __init__(self, window: int = 10_000) -> None:
+        self._latencies: deque[int] = deque(maxlen=window)
+        self._cpu = self._wall = 0.0
+
+    def block(self, arrived_ns: int, done_ns: int) -> None:
+        """A block that arrived at ``arrived_ns`` was dealt with at ``done_ns`` [ns]."""
+        self._latencies.append(done_ns - arrived_ns)
+
+    def report(self, cpu: float, wall: float) -> dict[str, float]:
+        """Median, 99 % point, maximum of the latency [ms]; share of a core since the last report.
+
+        cpu, wall: processor time used so far, and any steady clock [s]
+        """
+        share = (cpu - self._cpu) / (wall - self._wall) if wall > self._wall else 0.0
+        self._cpu, self._wall = cpu, wall
+        found = {"cpu_share": round(share, 4)}
+        if self._latencies:
+            points = np.percentile(np.fromiter(self._latencies, np.float64), (50, 99, 100))
+            scaled = points * NANOSECOND_S / MILLISECOND_S
+            names = ("latency_median_ms", "latency_p99_ms", "latency_max_ms")
+            found |= {
+                name: round(float(value), 3) for name, value in zip(names, scaled, strict=True)
+            }
+        return found
