@@ -20,7 +20,7 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 # No device here delivers more in one message; a longer block is a forgery or a wrong unit.
-MAX_BLOCK_SAMPLES = 1_000_000
+MAX_BLOCK_SAMPLES = 4_000_000
 
 
 class Status(IntEnum):

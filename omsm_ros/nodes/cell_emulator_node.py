@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
 from omsm_ros.emulators.pseudo_terminal import Pty
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.nodes.running import NAMESPACE, OK, Diagnostics, parameter, run
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
@@ -59,7 +59,11 @@ class CellEmulatorNode(Node):
         if self._player is not None and self._player.is_alive():
             response.success, response.message = False, "a motion is running; stop it first"
             return response
-        recording = motion_of(self._scenario)
+        try:
+            recording = motion_of(self._scenario)
+        except OmsmError as err:
+            response.success, response.message = False, str(err)
+            return response
         # A new device object: the trigger restarts its counter with each motion.
         emulator = GenericStreamEmulator(self._pty, faults=self._faults)
         self._stop.clear()

@@ -26,6 +26,8 @@ PAPER_STATIC_GAIN = PAPER_EQ_12.dc_gain
 
 # Slower than this, the rest of the lead-in would still be seen in the first sample.
 _LEAD_IN_TIME_CONSTANTS = 40
+# Bounds the memory of a long scan.
+_CHUNK_SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
@@ -71,18 +73,32 @@ def respond(
     a smooth motion. The delay is taken in the argument of the command, so it is exact too.
     """
     step = sample_period / substeps
-    lead = int(np.ceil(plant.lead_in() / sample_period)) * substeps
-    middles = (np.arange(-lead, samples * substeps) + 0.5) * step
-    servo, both = plant.servo, _series(plant.servo, plant.dynamics)
+    lead = int(np.ceil(plant.lead_in() / sample_period))
+    samples_with_lead = lead + samples
 
     def seen_through(system: TransferFunction, delay: float) -> FloatArray:
-        command = motion.positions(middles - delay).z
-        moved = _held_response(system, command, step)
-        return moved[lead - 1 :: substeps][:samples]
+        sections = _zero_order_hold_sections(system, step)
+        state = np.zeros((len(sections), 2))
+        start = _command(motion, -lead * sample_period - delay, 1, step)[0]
+        seen = []
+        for first in range(0, samples_with_lead, _CHUNK_SAMPLES):
+            count = min(_CHUNK_SAMPLES, samples_with_lead - first)
+            begin = (first - lead) * sample_period - delay
+            held = _command(motion, begin, count * substeps, step) - start
+            moved, state = signal.sosfilt(sections, held, zi=state)
+            seen.append(moved[substeps - 1 :: substeps])
+        # Sample k is the end of the step before it.
+        return np.asarray(np.concatenate(seen)[lead - 1 : -1] + system.dc_gain * start)
 
+    servo, both = plant.servo, _series(plant.servo, plant.dynamics)
     return Response(
         carriage=seen_through(servo, 0.0), probe=seen_through(both, plant.dynamics.delay)
     )
+
+
+def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
+    """Z commanded in the middle of each of ``count`` steps [s] after ``begin`` [s]."""
+    return motion.positions(begin + (np.arange(count) + 0.5) * step).z
 
 
 def _series(first: TransferFunction, second: TransferFunction) -> TransferFunction:
@@ -91,13 +107,6 @@ def _series(first: TransferFunction, second: TransferFunction) -> TransferFuncti
         multiply(first.numerator, second.numerator),
         multiply(first.denominator, second.denominator),
     )
-
-
-def _held_response(system: TransferFunction, held: FloatArray, step: float) -> FloatArray:
-    """Response at the end of each step to an input held over it, from steady state, (n,)."""
-    start = held[0]
-    sections = _zero_order_hold_sections(system, step)
-    return np.asarray(signal.sosfilt(sections, held - start) + system.dc_gain * start)
 
 
 def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArray:
