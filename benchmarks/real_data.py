@@ -2,7 +2,8 @@
 
 Each method identifies the first half of a DaISy record (De Moor et al., KU Leuven) and runs
 freely over the second, from a state it could know at the end of the first. The score is the
-variance accounted for there. Peers are optional: ``pip install nfoursid sippy_unipi ctrlsys pandas``.
+variance accounted for there.
+Peers are optional: ``pip install nfoursid sippy_unipi ctrlsys pandas``.
 """
 
 from __future__ import annotations
@@ -188,7 +189,7 @@ def table() -> list[dict[str, object]]:
                     continue
                 try:
                     value, seconds = _timed(lambda: score(method, record, order))  # noqa: B023
-                except Exception as error:  # noqa: BLE001  a peer's failure is a result
+                except Exception as error:
                     print(f"{peer} failed on {name} at order {order}: {error}")
                     continue
                 rows.append(_row(name, order, peer, value, seconds))

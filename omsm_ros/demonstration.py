@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros import bags, measurement, offline
+from omsm_ros.core import form
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.cloud import CLOUD_FIELDS
 from omsm_ros.core.discretise import discretise
@@ -22,6 +23,8 @@ from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
 from omsm_ros.files import load_calibration, read_ply
 from omsm_ros.report import response_figures, style
+from omsm_ros.report.cloud_view import CloudView
+from omsm_ros.report.figures import overview_figure
 from omsm_ros.report.gallery import surface_figures
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.plant import Plant
@@ -110,7 +113,8 @@ class Demonstration:
             log.unlink()
 
 
-_RESULTS = (measurement.CLOUD, measurement.SUMMARY, measurement.REPORT)
+OVERVIEW = "overview.png"
+_RESULTS = (measurement.CLOUD, measurement.SUMMARY, measurement.REPORT, OVERVIEW)
 
 
 def conclude(plan: Demonstration) -> dict[str, Any]:
@@ -135,6 +139,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
         true_error_left=(recording.probe_motion - recording.axes.z)[index] + view.dynamic_error,
     )
     figures |= calibration_figures(calibration, step_test_of(plan.scenario))
+    (plan.out / OVERVIEW).write_bytes(overview(view, calibration))
     measurement.publish(plan.out, TITLE, summary, calibration, figures)
     return summary
 
@@ -160,6 +165,17 @@ def response_errors(calibration: Calibration, true: TransferFunction) -> list[di
         {"frequency": float(f), "gain_error": float(g), "phase_error_deg": float(p)}
         for f, g, p in zip(frequency, gain, phase, strict=True)
     ]
+
+
+def overview(view: CloudView, calibration: Calibration) -> bytes:
+    """One wide picture: map before in µm, after in nm, identified and true response."""
+    weights = form.spiral_weights(view.x, view.y)
+    raw, corrected = (
+        form.level(view.x, view.y, form.deviation(view.x, view.y, h, PAPER_MIRROR), weights=weights)
+        for h in (view.raw_height, view.height)
+    )
+    figure = overview_figure(view.x, view.y, raw, corrected, calibration, Plant().dynamics)
+    return style.png(figure, dpi=120)
 
 
 def live_points(bag: Path) -> NDArray[np.void]:

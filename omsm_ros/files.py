@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -17,12 +18,13 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.calibration import SCHEMA, Calibration, content_id
 from omsm_ros.core.cloud import CLOUD_FIELDS, pack_points
+from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.records import SurfacePoints
 from omsm_ros.core.surface import Surface, surface_from_description
-from omsm_ros.errors import CalibrationError, FileError, SurfaceError
+from omsm_ros.errors import CalibrationError, ConfigurationError, FileError, SurfaceError
 
 MAX_CALIBRATION_BYTES = 4_000_000
-MAX_SURFACE_BYTES = 100_000
+MAX_YAML_BYTES = 100_000
 
 _COEFFICIENTS = {"type": "array", "items": {"type": "number"}, "minItems": 1, "maxItems": 64}
 _CALIBRATION_SCHEMA = {
@@ -186,23 +188,54 @@ def read_ply(path: Path | str) -> NDArray[np.void]:
     return np.frombuffer(body, _PLY_DTYPE)
 
 
-# --------------------------------------------------------------------- surface, summary
+# ----------------------------------------------------------- surface, geometry, summary
 
 
 def load_surface(path: Path | str) -> Surface:
     """Read ``SURFACE.yaml``: ``shape`` and its parameters in metres."""
-    path = Path(path)
-    text = _read_text(path, MAX_SURFACE_BYTES, SurfaceError, "surface")
-    try:
-        description = yaml.safe_load(text)
-    except yaml.YAMLError as err:
-        raise SurfaceError(f"{str(path)!r} is not YAML: {err}".replace("\n", " ")) from err
-    if not isinstance(description, dict):
-        raise SurfaceError(f"{str(path)!r} holds {description!r:.80}, expected shape and lengths")
+    description = _read_mapping(path, "surface", SurfaceError)
     try:
         return surface_from_description(description)
     except SurfaceError as err:
         raise SurfaceError(f"{str(path)!r}: {err}") from err
+
+
+def load_geometry(path: Path | str) -> Geometry:
+    """Read ``GEOMETRY.yaml``: where the probe sits and looks, in metres and slopes."""
+    values = _read_mapping(path, "geometry", FileError)
+    names = [field.name for field in fields(Geometry)]
+    for name, value in values.items():
+        if name not in names:
+            raise FileError(f"{str(path)!r}: {name!r} is unknown, expected one of {names}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise FileError(f"{str(path)!r}: {name} is {value!r}, expected a number")
+    try:
+        return Geometry(**values)
+    except ConfigurationError as err:
+        raise FileError(f"{str(path)!r}: {err}") from err
+
+
+def save_geometry(path: Path | str, geometry: Geometry) -> None:
+    """Write ``GEOMETRY.yaml``."""
+    save_text(path, yaml.safe_dump(asdict(geometry), sort_keys=False))
+
+
+def _read_mapping(path: Path | str, what: str, error: type[FileError]) -> dict[str, Any]:
+    path = Path(path)
+    text = _read_text(path, MAX_YAML_BYTES, error, what)
+    try:
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as err:
+        raise error(f"{str(path)!r} is not YAML: {err}".replace("\n", " ")) from err
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise error(f"{str(path)!r} holds {content!r:.80}, expected names and values of a {what}")
+    return content
+
+
+def save_text(path: Path | str, text: str) -> None:
+    """Write a text file."""
+    with whole_file(path, "w") as stream:
+        stream.write(text)
 
 
 def save_json(path: Path | str, content: Mapping[str, object]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -15,15 +15,32 @@ from numpy.typing import NDArray
 
 from omsm_ros import __version__, offline
 from omsm_ros.core import form
+from omsm_ros.core.applicability import admit, objections
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.correct import CorrectionOptions
+from omsm_ros.core.records import FloatArray
 from omsm_ros.core.surface import Surface
+from omsm_ros.errors import DataError
 from omsm_ros.files import read_ply, save_json, whole_file
+from omsm_ros.report import style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.gallery import surface_figures
 from omsm_ros.report.page import Report, render
+from omsm_ros.report.response_figures import bode
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
+
+
+@dataclass(frozen=True)
+class Admission:
+    """May a calibration be used here?
+
+    settings: of this scan, to be compared with the calibration's; None = not known
+    override: use it all the same; what spoke against it is written into every result
+    """
+
+    settings: Mapping[str, object] | None = None
+    override: bool = False
 
 
 def measure(
@@ -33,13 +50,29 @@ def measure(
     *,
     nominal: Surface | None = None,
     options: CorrectionOptions | None = None,
+    admission: Admission | None = None,
     progress: offline.Progress = offline.no_progress,
 ) -> dict[str, Any]:
-    """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary."""
-    account = offline.correct_bag(bag, calibration, out / CLOUD, options=options, progress=progress)
-    view = view_of(read_ply(out / CLOUD), calibration.sample_period)
+    """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
+
+    Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
+    """
+    options, asked = options or CorrectionOptions(), admission or Admission()
+    period = offline.sample_period_of(bag)
+    reasons = objections(
+        calibration, sample_period=period, settings=asked.settings, polarity=options.polarity
+    )
+    admitted = admit(calibration, reasons, asked.override)
+    comment = "; ".join(["OVERRIDDEN", *reasons]) if reasons else ""
+    account = offline.correct_bag(
+        bag, calibration, out / CLOUD, options=options, comment=comment, progress=progress
+    )
+    view = view_of(read_ply(out / CLOUD), period)
     summary = summarise(bag, account, view, calibration, nominal)
+    summary["admission"] = admitted
+    summary["warnings"] += [f"overridden: {reason}" for reason in reasons]
     figures = surface_figures(view, nominal) if view is not None else {}
+    figures["bode"] = style.png(bode(calibration, None, period))
     publish(out, f"Surface of {bag.name}", summary, calibration, figures)
     return summary
 
@@ -85,24 +118,41 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY, "report": REPORT},
     }
+    summary["warnings"] = _warnings(bag, calibration, view)
     if view is None:
-        return summary | {"warnings": ["not one sample could be corrected; see the reasons"]}
+        return summary
+    weights = form.spiral_weights(view.x, view.y)
+    removed = form.statistics(view.dynamic_error - np.mean(view.dynamic_error), weights)
+    summary["dynamic_error_before"] = {
+        "peak_to_valley": removed.peak_to_valley,
+        "rms": removed.rms_area_weighted,
+    }
     summary["uncertainty"] = {
         "median": float(np.median(view.uncertainty)),
         "largest": float(np.max(view.uncertainty)),
     }
     if nominal is not None:
-        summary["deviation"] = _deviation(view, nominal)
+        summary["deviation"] = _deviation(view, nominal, weights)
     return summary
 
 
-def _deviation(view: CloudView, nominal: Surface) -> dict[str, Any]:
-    weights = form.spiral_weights(view.x, view.y)
-    heights = {"raw": view.raw_height, "corrected": view.height}
-    return {
-        name: asdict(form.statistics(form.deviation(view.x, view.y, height, nominal), weights))
-        for name, height in heights.items()
-    }
+def _warnings(bag: Path, calibration: Calibration, view: CloudView | None) -> list[str]:
+    if view is None:
+        return ["not one sample could be corrected; see the reasons"]
+    try:
+        prediction = offline.predict_from(calibration, str(bag), np.empty(0), 0.0)
+    except DataError as err:
+        return [f"the motion could not be judged: {err}"]
+    return [] if prediction.safe else [prediction.message]
+
+
+def _deviation(view: CloudView, nominal: Surface, weights: FloatArray) -> dict[str, Any]:
+    found = {}
+    for name, height in (("raw", view.raw_height), ("corrected", view.height)):
+        error = form.deviation(view.x, view.y, height, nominal)
+        levelled = form.level(view.x, view.y, error, weights=weights)
+        found[name] = asdict(form.statistics(levelled, weights))
+    return found
 
 
 def publish(

@@ -12,13 +12,21 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros import bags
+from omsm_ros.core.align import Alignment, align_on_sphere, sphere_scan_of
 from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.discretise import discretise
+from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.motion_record import MotionRecord, assemble
 from omsm_ros.core.predict import Prediction, predict_error
-from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray, SurfacePoints
+from omsm_ros.core.recursion import Recursion, past_motion
+from omsm_ros.core.reversal import SidewaysLag, sideways_lag
+from omsm_ros.core.validate import PathCheck, check_path
 from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.files import PlyWriter
+
+_START_SAMPLES = 12
 
 Progress = Callable[[int, int], None]
 """Called with messages done and messages in all."""
@@ -72,12 +80,21 @@ def _beginning(blocks: list[Block], duration: float) -> list[Block]:
 # ---------------------------------------------------------------------------- correction
 
 
+def sample_period_of(path: Path) -> float:
+    """Sample period of the axes in a bag [s], from the first block."""
+    with bags.BagReader(path) as bag:
+        for _, block in bag.records(bags.AXES_TOPIC):
+            return float(block.sample_period)
+    raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a scan")
+
+
 def correct_bag(
     path: Path,
     calibration: Calibration,
     cloud: Path,
     *,
     options: CorrectionOptions | None = None,
+    comment: str = "",
     progress: Progress = no_progress,
 ) -> dict[str, object]:
     """Correct a bag into ``cloud`` (PLY) and return the account of its samples.
@@ -88,7 +105,7 @@ def correct_bag(
     topics = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
     with (
         bags.BagReader(path) as bag,
-        PlyWriter(cloud, comment=f"omsm_ros, metres, calibration {calibration.id}") as ply,
+        PlyWriter(cloud, f"omsm_ros, metres, calibration {calibration.id} {comment}") as ply,
     ):
         total = bag.count(topics)
         for done, (_, record) in enumerate(bag.records(*topics), start=1):
@@ -104,22 +121,97 @@ def correct_bag(
     return dict(corrector.account.as_dict())
 
 
+# ------------------------------------------------------------------- scans as a whole
+
+
+def scan_points(
+    path: Path,
+    calibration: Calibration,
+    options: CorrectionOptions,
+    progress: Progress = no_progress,
+) -> tuple[SurfacePoints, list[AxisBlock]]:
+    """All corrected points of a bag in memory, and the axes they came from."""
+    blocks = read_blocks(path, [bags.AXES_TOPIC, bags.DISTANCE_TOPIC], progress)
+    axes = [b for b in blocks[bags.AXES_TOPIC] if isinstance(b, AxisBlock)]
+    corrector = Corrector(calibration, options)
+    for block in axes:
+        corrector.push_axes(block)
+    for reading in blocks[bags.DISTANCE_TOPIC]:
+        if isinstance(reading, DistanceBlock):
+            corrector.push_distance(reading)
+    points = join_points([corrector.take(), corrector.finish()])
+    if not len(points):
+        raise BagError(
+            f"{str(path)!r} gives no surface point: {corrector.account.as_dict()!r}; "
+            "look at it with 'omsm inspect'"
+        )
+    return points, axes
+
+
+def sideways_lag_of(
+    bag_paths: Sequence[Path], calibration: Calibration, progress: Progress = no_progress
+) -> SidewaysLag:
+    """Lag of the probe against X and C from scans with opposite spindle directions."""
+    options = CorrectionOptions(lateral_lag=0.0)
+    scans = [scan_points(path, calibration, options, progress)[0] for path in bag_paths]
+    return sideways_lag(scans, calibration)
+
+
+def alignment_of(
+    path: Path,
+    calibration: Calibration,
+    radius: float,
+    geometry: Geometry,
+    progress: Progress = no_progress,
+) -> Alignment:
+    """Spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m]."""
+    options = CorrectionOptions(lateral_lag=0.0)
+    points, axes = scan_points(path, calibration, options, progress)
+    return align_on_sphere(sphere_scan_of(points, axes), radius, geometry)
+
+
+def path_check_of(
+    path: Path, calibration: Calibration, progress: Progress = no_progress
+) -> PathCheck:
+    """The paper's Fig. 9: errors and phase lags of a free path on a fixed target."""
+    record = motion_of_bag(path, progress=progress)
+    recursion = Recursion(discretise(calibration.dynamics, record.sample_period))
+    recursion.start(past_motion(record.z[:_START_SAMPLES]))
+    return check_path(
+        record.z,
+        _bridged(record),
+        recursion.run(record.z),
+        calibration.static_gain,
+        record.sample_period,
+    )
+
+
+def _bridged(record: MotionRecord) -> FloatArray:
+    """Distance with its dropouts bridged by straight lines: the Hilbert transform needs no gaps."""
+    index = np.arange(len(record))
+    return np.interp(index, index[record.ok], record.distance[record.ok])
+
+
 # ------------------------------------------------------------------------------- preview
+
+
+def motion_in(path: Path, progress: Progress = no_progress) -> tuple[FloatArray, float]:
+    """Z of a bag [m] and its sample period [s]."""
+    blocks = read_blocks(path, [bags.AXES_TOPIC], progress)[bags.AXES_TOPIC]
+    if not blocks:
+        raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
+    z = np.concatenate([b.z for b in blocks if isinstance(b, AxisBlock)])
+    return z, blocks[0].sample_period
 
 
 def predict_from(
     calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
 ) -> Prediction:
     """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty."""
-
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
-        blocks = read_blocks(Path(bag), [bags.AXES_TOPIC])[bags.AXES_TOPIC]
-        if not blocks:
-            raise BagError(f"{bag!r} has no samples on {bags.AXES_TOPIC!r}")
-        z = np.concatenate([b.z for b in blocks if isinstance(b, AxisBlock)])
-        sample_period = blocks[0].sample_period
+        z, sample_period = motion_in(Path(bag))
     return predict_error(calibration, np.asarray(z, np.float64), sample_period)
 
 

@@ -102,7 +102,7 @@ def audit(
         for order in ORDERS
     ]
     if dynamics.delay == 0:
-        trapezoid = bilinear(dynamics.numerator, dynamics.denominator, sample_period)
+        trapezoid = bilinear(dynamics, sample_period)
         filters.append(("bilinear", None, trapezoid))
     judged = [
         Audit(name, order, *discretisation_error(dynamics, digital, z, up_to), digital.noise_gain)

@@ -24,8 +24,8 @@ _RANK_TOLERANCE = 1e-13
 class ResponseLimits:
     """Half-widths of the 95 % band within which a response is trusted: gain [1], phase [rad]."""
 
-    gain: float = 0.01
-    phase: float = 1.0 * DEGREE_RAD
+    gain: float = 0.005
+    phase: float = 0.5 * DEGREE_RAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,20 +37,22 @@ class Band:
     phase: FloatArray
 
 
-def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
-    """Variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies; white is flat.
+def autoregression(
+    residual: FloatArray, highest: int = _MAX_NOISE_ORDER
+) -> tuple[FloatArray, float]:
+    """Whitening filter [1, a1 …] of a residual (n,) and the variance it leaves.
 
-    An autoregression by Yule and Walker, its order by BIC; order 0 gives the plain variance.
+    By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
     """
     n = len(residual)
     size = fft.next_fast_len(2 * n, real=True)
     power = np.abs(fft.rfft(residual, size)) ** 2
-    lags = fft.irfft(power, size)[: _MAX_NOISE_ORDER + 1] / n
-    if lags[0] <= 0:
-        return np.zeros(length // 2 + 1)
+    lags = fft.irfft(power, size)[: highest + 1] / n
     coefficients, variance = np.ones(1), float(lags[0])
+    if variance <= 0:
+        return coefficients, 0.0
     best = (n * np.log(variance), coefficients, variance)
-    for order in range(1, _MAX_NOISE_ORDER + 1):
+    for order in range(1, min(highest, n - 1) + 1):
         # Levinson's recursion.
         reflection = -(coefficients @ lags[order:0:-1]) / variance
         padded = np.append(coefficients, 0.0)
@@ -59,13 +61,16 @@ def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
         score = n * np.log(variance) + order * np.log(n)
         if score < best[0]:
             best = (score, coefficients, variance)
-    _, coefficients, variance = best
+    return np.asarray(best[1]), best[2]
+
+
+def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
+    """Variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies; white is flat."""
+    coefficients, variance = autoregression(residual)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
 
 
-def parameter_covariance(
-    problem: Problem, columns: FloatArray, residual: FloatArray
-) -> FloatArray:
+def parameter_covariance(problem: Problem, columns: FloatArray, residual: FloatArray) -> FloatArray:
     """(q, q) covariance of the parameters of ``columns`` (k, q), coloured residual allowed.
 
     The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
@@ -90,25 +95,31 @@ def parameter_covariance(
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def delay_direction(dynamics: TransferFunction) -> FloatArray:
-    """d(numerator, denominator[1:], delay) of a small extra delay, to second order in s, (p,).
+def hidden_motion_covariance(
+    dynamics: TransferFunction, delay_bound: float, sample_period: float
+) -> FloatArray:
+    """Covariance (p, p) of the coefficients due to motion hidden between samples.
 
-    Where a structure has no delay of its own, it moves the numerator: e^{-τs} ≈ 1 - τs.
+    Folded motion shifts the lag by up to ``delay_bound`` [s], and bends the response by a
+    term in s² as the folded content varies over a tenth of the sampling rate around it.
+    Either is a bound, taken as a uniform distribution: its standard deviation is 1/√3 of it.
     """
-    numerator, denominator = dynamics.numerator, dynamics.denominator
-    direction = np.zeros(len(numerator) + len(denominator))
-    if len(numerator) == 1 and len(denominator) > 1:
-        # No zero to move either: the first-order lag of the denominator takes it.
-        direction[len(numerator)] = 1.0
-    elif len(numerator) == 1:
-        direction[-1] = 1.0
-    else:
-        direction[1 : len(numerator)] = -numerator[:-1]
-    return direction
+    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
+    directions = np.zeros((2, zeros + poles + 2))
+    bend = delay_bound * sample_period / (2 * np.pi * 0.1)
+    for row, (power, size) in enumerate(((1, delay_bound), (2, bend))):
+        if poles >= power:
+            directions[row, zeros + power] = size / np.sqrt(3)
+        elif power == 1:
+            directions[row, -1] = size / np.sqrt(3)
+    return directions.T @ directions
 
 
 def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray) -> FloatArray:
-    """d(ln|G|, arg G)/d(numerator, denominator[1:], delay) at ``frequency`` (k,), shape (2, k, p)."""
+    """d(ln|G|, arg G)/d(numerator, denominator[1:], delay), shape (2, k, p).
+
+    frequency: (k,) [Hz]
+    """
     s = 2j * np.pi * np.asarray(frequency, np.float64)[:, np.newaxis]
     up = s ** np.arange(len(dynamics.numerator)) / polynomial.polyval(s, dynamics.numerator)
     powers = np.arange(1, len(dynamics.denominator))

@@ -220,7 +220,8 @@ class Corrector:
             self._sources, self._noise_gain, self._static_gain, reading, dynamics, timing
         )
         for name, variance in variances.items():
-            self._variance[name] += float(np.sum(np.broadcast_to(variance, reading.shape)))
+            common = isinstance(variance, float)
+            self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)
         return np.sqrt(sum(variances.values()))
 
 

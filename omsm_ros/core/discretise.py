@@ -18,10 +18,12 @@ from numpy.polynomial import polynomial
 from scipy import linalg, signal
 
 from omsm_ros.core.records import FloatArray
-from omsm_ros.core.transfer_function import ComplexArray, TransferFunction, ascending_roots
+from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.errors import ConfigurationError
 
 DEFAULT_ORDER = 3
+# Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.
+_MATCHED_RAD = 0.02
 # A zero this far out is a constant factor to 1e-9 of the gain, or infinity after rounding.
 _FAR_ZERO = 1e9
 
@@ -80,8 +82,23 @@ def discretise(
     late += len(poles) - len(zeros)
     zeros = np.concatenate([zeros, delay_zeros])
     poles = np.append(poles, np.zeros(len(delay_zeros)))
-    gain = dynamics.dc_gain * np.real(np.prod(1 - poles) / np.prod(1 - zeros))
+    gain = _gain(dynamics, sample_period, zeros, poles, late)
     return DigitalFilter(_sections(zeros, poles, gain, late), sample_period)
+
+
+def _gain(
+    dynamics: TransferFunction,
+    sample_period: float,
+    zeros: ComplexArray,
+    poles: ComplexArray,
+    late: int,
+) -> float:
+    """The factor that makes H equal to G at 0 Hz, or close to 0 where G(0) = 0."""
+    angle = 0.0 if dynamics.dc_gain != 0 else _MATCHED_RAD
+    z = np.exp(1j * angle)
+    monic = np.prod(1 - zeros / z) / np.prod(1 - poles / z) * z**-late
+    wanted = dynamics.response(np.array([angle / (2 * np.pi * sample_period)]))[0]
+    return float(np.real(wanted / monic))
 
 
 def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
@@ -92,21 +109,11 @@ def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) 
     return np.vstack([signal.zpk2sos(zeros, poles, gain), *np.reshape(delays, (-1, 1, 6))])
 
 
-def bilinear(numerator: FloatArray, denominator: FloatArray, sample_period: float) -> DigitalFilter:
-    """The bilinear transform of a ratio of polynomials in s, ascending, without delay.
-
-    A numerator of higher degree is made proper by poles at -2/T, which map to z = 0: below
-    Nyquist that is half a sample of delay each.
-    """
-    zeros, poles = ascending_roots(numerator), ascending_roots(denominator)
-    gain = np.trim_zeros(numerator, "b")[-1] / np.trim_zeros(denominator, "b")[-1]
-    excess = max(len(zeros) - len(poles), 0)
-    rate = 1 / sample_period
-    poles = np.append(poles, np.full(excess, -2 * rate))
-    gain = gain * (2 * rate) ** excess
-    return DigitalFilter(
-        np.asarray(signal.zpk2sos(*signal.bilinear_zpk(zeros, poles, gain, rate))), sample_period
-    )
+def bilinear(dynamics: TransferFunction, sample_period: float) -> DigitalFilter:
+    """The bilinear transform of G without its delay."""
+    leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
+    zpk = signal.bilinear_zpk(dynamics.zeros(), dynamics.poles(), leading, 1 / sample_period)
+    return DigitalFilter(np.asarray(signal.zpk2sos(*zpk)), sample_period)
 
 
 def _sampled_zeros(dynamics: TransferFunction, sample_period: float, order: int) -> ComplexArray:
@@ -128,7 +135,12 @@ def _sampled_zeros(dynamics: TransferFunction, sample_period: float, order: int)
     pencil = np.block([[system, entry[:, np.newaxis]], [exit_row, np.array([direct])]])
     mass = linalg.block_diag(np.eye(n + order), 0.0)
     zeros = linalg.eigvals(pencil, mass)
-    return np.asarray(zeros[np.isfinite(zeros) & (abs(zeros) < _FAR_ZERO)], np.complex128)
+    zeros = zeros[np.isfinite(zeros) & (abs(zeros) < _FAR_ZERO)]
+    # What G takes the derivative of, interpolation keeps: those zeros are at 1 exactly, but
+    # eigenvalues that coincide are computed to a few digits only.
+    at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
+    zeros[np.argsort(abs(zeros - 1))[:at_rest]] = 1.0
+    return np.asarray(zeros, np.complex128)
 
 
 def _state_space(

@@ -196,14 +196,16 @@ def _stretches(position: FloatArray, spacing: float) -> IntArray:
         raise DataError(f"spacing of a profile is {spacing!r} m, expected a positive number")
     extent = float(np.max(np.abs(position), initial=0.0)) / spacing
     if extent > _MOST_STRETCHES:
-        raise DataError(f"spacing {spacing!r} m cuts the profile into {extent:.0f} stretches; widen it")
-    return np.floor(position / spacing).astype(np.int64)
+        raise DataError(
+            f"spacing {spacing!r} m cuts the profile into {extent:.0f} stretches; widen it"
+        )
+    return np.asarray(np.floor(position / spacing), np.int64)
 
 
 def _cell_numbers(values: FloatArray, cells: int) -> IntArray:
     span = np.ptp(values) or 1.0
-    number = ((values - values.min()) / span * cells).astype(np.int64)
-    return np.minimum(number, cells - 1)
+    number = (values - values.min()) / span * cells
+    return np.asarray(np.minimum(number, cells - 1), np.int64)
 
 
 def _mean_one(weights: FloatArray) -> FloatArray:

@@ -24,8 +24,11 @@ _MAX_HANKEL_COLUMNS = 20_000
 
 @dataclass(frozen=True, eq=False)
 class HankelVote:
-    """singular_values: in units of the largest that noise alone would give (~1);
-    order: how many exceed it; poles: of that order [rad/s]; empty where data were too few."""
+    """What the singular values say; empty where the data were too few.
+
+    singular_values: in units of the largest that noise alone would give
+    order: how many exceed it;  poles: of that order [rad/s]
+    """
 
     singular_values: FloatArray
     order: int
@@ -61,7 +64,7 @@ def _subspace(inputs: FloatArray, outputs: FloatArray, rows: int, period: float)
     stacked = np.concatenate(
         [inputs[:, rows:], inputs[:, :rows], outputs[:, :rows], outputs[:, rows:]], axis=1
     )
-    lower = np.linalg.qr(stacked, mode="r").T
+    lower = np.asarray(np.linalg.qr(stacked, mode="r")).T
     future, noise = lower[3 * rows :, rows : 3 * rows], lower[3 * rows :, 3 * rows :]
     left, values, _ = np.linalg.svd(future)
     sigma = np.linalg.norm(noise) / np.sqrt(rows * len(inputs))

@@ -25,34 +25,27 @@ def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: fl
     With U the spectrum of an edge of height A, what folds onto low frequencies is U at the
     sampling rate on both sides, so the lag shifts by up to ``2 |U(f_s)| (1 + |G|) / A``.
     U(f_s) is extrapolated from the content below f_s / 2 at the rate at which an edge with
-    finite acceleration falls, 1/f³. A motion without edges is measured by its total change.
+    finite acceleration falls, 1/f³. A motion without edges is taken as one long edge.
     """
-    content, height = _top_content(motion, steps)
-    if height == 0:
-        return 0.0
-    rate = 1 / sample_period
-    top = 0.5 * sum(_TOP_BAND) * rate
-    # |ΔU| = |1 - exp(-jωT)| |U|, nearly 2 |U| at the top.
-    at_top = content / 2 * sample_period
-    at_rate = at_top * (top / rate) ** 3
-    return float(2 * at_rate * (1 + _GREATEST_GAIN_BEYOND) / height)
-
-
-def _top_content(motion: FloatArray, steps: Steps) -> tuple[float, float]:
-    """rms of |FFT of the increments| in the top band above noise [m], and height [m], per edge."""
     increments = np.diff(motion)
     pieces = [
         increments[max(edge.start - _MARGIN_SAMPLES, 0) : edge.stop + _MARGIN_SAMPLES]
         for edge in steps.edges
-    ] or [increments]
-    energy, height = 0.0, 0.0
-    for piece in pieces:
-        power = np.abs(np.fft.rfft(piece * np.hanning(len(piece) + 2)[1:-1])) ** 2 if not steps.edges else np.abs(np.fft.rfft(piece)) ** 2
-        frequency = np.fft.rfftfreq(len(piece))
-        band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])
-        if np.any(band):
-            mean_square = np.mean(np.abs(1 - np.exp(-2j * np.pi * frequency[band])) ** 2)
-            energy += float(np.mean(power[band])) - len(piece) * steps.noise**2 * mean_square
-        height += float(np.sum(np.abs(piece))) ** 2 if not steps.edges else 0.0
-    height += sum(edge.height**2 for edge in steps.edges)
-    return float(np.sqrt(max(energy, 0.0))), float(np.sqrt(height))
+    ] or [increments * np.hanning(len(increments))]
+    energy = sum(_top_energy(piece, steps.noise) for piece in pieces)
+    height = sum(float(np.sum(np.abs(piece))) ** 2 for piece in pieces)
+    if energy <= 0:
+        return 0.0
+    # |ΔU| = |1 - exp(-jωT)| |U| is nearly 2 |U| / T at the top.
+    at_top = 0.5 * sample_period * np.sqrt(energy / height)
+    at_rate = at_top * (0.5 * sum(_TOP_BAND)) ** 3
+    return float(2 * at_rate * (1 + _GREATEST_GAIN_BEYOND))
+
+
+def _top_energy(increments: FloatArray, noise: float) -> float:
+    """Mean |FFT of the increments|² in the top band [m²], less what encoder noise gives."""
+    power = np.abs(np.fft.rfft(increments)) ** 2
+    frequency = np.fft.rfftfreq(len(increments))
+    band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])
+    doubled = np.abs(1 - np.exp(-2j * np.pi * frequency[band])) ** 2
+    return float(np.mean(power[band] - len(increments) * noise**2 * doubled))

@@ -13,12 +13,12 @@ import numpy as np
 
 from omsm_ros.core.account import Reason
 from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.discretise import DEFAULT_ORDER, DigitalFilter, bilinear, discretise
+from omsm_ros.core.discretise import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.pairing import Run
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.core.uncertainty import sensitivity_filters
+from omsm_ros.core.uncertainty import differentiable, sensitivity_filters
 
 # The share of a wrong start that may be left in the first published point.
 SETTLED = 1e-6
@@ -56,11 +56,12 @@ class MotionFilters:
         """The filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator) * lateral_lag_uncertainty
+        timing = differentiable(rate, g.denominator, g.delay, sample_period) if any(rate) else None
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
         return cls(
             height=discretise(g, sample_period, order),
             dynamics=sensitivity_filters(calibration, sample_period),
-            timing=bilinear(rate, g.denominator, sample_period) if rate.any() else None,
+            timing=timing,
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
         )
 

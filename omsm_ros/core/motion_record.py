@@ -268,7 +268,9 @@ def _by_stamp(
     second = None
     if reference:
         other = _distance_stream(reference)
-        second = np.interp(grid, (_times(reference, other) + clock_offset)[other.ok], other.value[other.ok])
+        second = np.interp(
+            grid, (_times(reference, other) + clock_offset)[other.ok], other.value[other.ok]
+        )
     return MotionRecord(
         sample_period=period,
         z=np.asarray(interpolate.CubicSpline(axis_time, axis.value[axis.ok])(grid)),

@@ -12,15 +12,18 @@ which the band states, is preferred to bias, which nobody sees.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.output_error import Fit
+from omsm_ros.core.output_error import Fit, Problem, fit
+from omsm_ros.core.records import BoolArray
 from omsm_ros.core.structure import Structure
 
 MAX_POLES = 8
 _LEAST_PARAMETERS = 3
+# Held-out rms, relative: far above its scatter over a few thousand samples.
+_CLEARLY_WORSE = 1.05
 
 
 def structures(poles: int) -> list[Structure]:
@@ -92,10 +95,15 @@ def _promising(
     return [s for s in every[:-1] if free + s.size * per_parameter < best]
 
 
-def choose(candidates: Sequence[Candidate]) -> Candidate:
+def choose(
+    candidates: Sequence[Candidate], held_out: Callable[[Fit], float]
+) -> tuple[Candidate, list[Candidate]]:
     """The best by BIC, enriched: the best of those that contain it with one parameter more.
 
     With fewer than three parameters, lag and roll-off could not both bend over the band.
+    The enriched one is vetoed where it is clearly worse on edges it has not seen.
+
+    held_out: rms [m] of a structure, fitted without the held-out edges, on them
     """
     smallest = min(candidates, key=lambda c: c.bic)
     wanted = max(smallest.fit.structure.size + 1, _LEAST_PARAMETERS)
@@ -104,6 +112,21 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
         for c in candidates
         if c.fit.structure.contains(smallest.fit.structure) and c.fit.structure.size >= wanted
     ]
-    return min(
+    enriched = min(
         richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest
     )
+    scored = {c: replace(c, held_out=held_out(c.fit)) for c in {smallest, enriched}}
+    chosen = scored[enriched]
+    if chosen.held_out > _CLEARLY_WORSE * scored[smallest].held_out:
+        chosen = scored[smallest]
+    return chosen, [scored.get(c, c) for c in candidates]
+
+
+def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
+    """rms [m] over the samples ``held`` (n,) of the structure fitted without them; NaN if none."""
+    rest, unseen = problem.used & ~held, problem.used & held
+    if not (np.any(rest) and np.any(unseen)):
+        return float("nan")
+    without = fit(replace(problem, used=rest), fitted.structure, [fitted.shape])
+    missed = problem.seen[unseen] - problem.output(without)[unseen]
+    return float(np.sqrt(np.mean(missed**2)))

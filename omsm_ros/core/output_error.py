@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import fft, optimize
+from scipy import fft, ndimage, optimize
 
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.structure import Scaled, Structure
@@ -27,17 +27,36 @@ from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 _BRIDGE_S = 0.3
 _MIN_BRIDGE_SAMPLES = 64
 _RANK_TOLERANCE = 1e-12
+_SMOOTHING_BINS = 101
 _RACE_EVALUATIONS = 5
 _FINISH_EVALUATIONS = 60
 
 
 def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """``motion`` (n,) followed by a smooth way back to its start, of a length quick to transform."""
+    """``motion`` (n,) and a smooth way back to its start, of a length quick to transform."""
     bridge = max(round(_BRIDGE_S / period), _MIN_BRIDGE_SAMPLES)
     total = fft.next_fast_len(len(motion) + bridge, real=True)
     phase = np.arange(1, total - len(motion) + 1) / (total - len(motion) + 1)
     way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
     return np.concatenate([motion, way_back])
+
+
+def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
+    """The part of a motion's ``spectrum`` (k,) that is motion, up to its last such frequency.
+
+    Wiener's filter. Where an encoder shows only its noise, the probe saw nothing of it;
+    a fit that took it for motion would be paid for a response that vanishes there.
+    """
+    if noise_power <= 0:
+        return spectrum
+    width = min(_SMOOTHING_BINS, len(spectrum))
+    power = np.abs(spectrum) ** 2
+    smooth = ndimage.uniform_filter1d(power, width, mode="nearest")
+    weight = np.clip(1 - noise_power / np.maximum(smooth, np.finfo(np.float64).tiny), 0.0, 1.0)
+    # A mean of m exponential variables scatters by 1/√m; twice that is not motion.
+    weight[weight < 3 / np.sqrt(width)] = 0.0
+    last = int(np.flatnonzero(weight)[-1]) if np.any(weight) else 0
+    return np.asarray((weight * spectrum)[: last + 1], np.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +65,7 @@ class Problem:
 
     background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
     rate: [rad/s] unit of s inside the fit
+    noise: standard deviation of a sample of the motion [m]
     """
 
     motion: FloatArray
@@ -54,23 +74,32 @@ class Problem:
     period: float
     background: FloatArray
     rate: float
+    noise: float = 0.0
 
     @cached_property
-    def _closed_length(self) -> int:
+    def closed_length(self) -> int:
+        """Samples of one period."""
         return len(close_period(self.motion, self.period))
+
+    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
+        closed = fft.rfft(close_period(values, self.period))
+        return np.asarray(closed, np.complex128)[: len(self.s)]
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
-        return np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
+        raw = np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
+        return denoised(raw, self.closed_length * self.noise**2)
 
     @cached_property
-    def _s(self) -> ComplexArray:
-        omega = 2 * np.pi * fft.rfftfreq(self._closed_length, self.period)
-        return np.asarray(1j * omega / self.rate, np.complex128)
+    def s(self) -> ComplexArray:
+        """jω / rate of the transform of the closed motion, up to its last content, (k,)."""
+        omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
+        return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
 
-    def scaled_frequencies(self) -> ComplexArray:
-        """jω / rate of the transform of the closed motion, (k,)."""
-        return self._s
+    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
+        """What drives the system: spectra (k,), each with its number of numerator terms."""
+        return [(self._spectrum, structure.zeros + 1)]
 
     @cached_property
     def _target(self) -> FloatArray:
@@ -81,36 +110,43 @@ class Problem:
         return self.background[self.used]
 
     def _in_time(self, spectrum: ComplexArray) -> FloatArray:
-        back = fft.irfft(spectrum, self._closed_length, axis=-1)
+        back = fft.irfft(spectrum, self.closed_length, axis=-1)
         return np.asarray(back[..., : len(self.motion)][..., self.used], np.float64)
-
-    def filtered(self, response: ComplexArray) -> FloatArray:
-        """The motion through ``response`` where it is used, and any leading axes."""
-        return self._in_time(response * self._spectrum)
 
     def project(self, scaled: Scaled, shape: FloatArray) -> Projection:
         """Residual and its derivative by ψ after the linear parameters are eliminated."""
-        lag, relative = scaled.lag(shape, self._s)
-        powers = self._s ** np.arange(scaled.structure.zeros + 1)[:, np.newaxis]
-        columns = np.column_stack([self.filtered(powers * lag).T, self._fixed])
+        lag, relative = scaled.lag(shape, self.s)
+        driven = self._driven(scaled.structure, lag)
+        columns = np.column_stack([self._in_time(driven).T, self._fixed])
         basis, triangle = np.linalg.qr(columns)
         linear = _solve(triangle, basis.T @ self._target)
         residual = self._target - columns @ linear
-        response = (linear[: len(powers)] @ powers) * lag
-        moved = self.filtered(relative * response).T
+        moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
         jacobian = basis @ (basis.T @ moved) - moved
         return Projection(residual, jacobian, linear)
 
+    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
+        """Spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
+        terms = [
+            self.s ** np.arange(count)[:, np.newaxis] * (lag * spectrum)
+            for spectrum, count in self.drives(structure)
+        ]
+        return np.concatenate(terms)
+
+    def output(self, fitted: Fit) -> FloatArray:
+        """What the fitted model says is seen, at every sample, (n,)."""
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        spectrum = fitted.driven @ self._driven(fitted.structure, lag)
+        moved = fft.irfft(spectrum, self.closed_length)[: len(self.motion)]
+        return np.asarray(moved + self.background @ fitted.background)
+
     def sensitivity(self, fitted: Fit) -> FloatArray:
-        """-d residual / d(numerator[1:], ψ, gain, background) at a fit, shape (k, m + len ψ + 1 + q)."""
-        scaled = fitted.scaled
-        lag, relative = scaled.lag(fitted.shape, self._s)
-        powers = self._s ** np.arange(scaled.structure.zeros + 1)[:, np.newaxis]
-        response = (fitted.numerator @ powers) * lag
-        by_dynamics = self.filtered(np.concatenate([powers[1:] * lag, relative * response])).T
-        return np.column_stack(
-            [fitted.gain * by_dynamics, self.filtered(response), self._fixed]
-        )
+        """d output / d(numerator[1:], ψ, gain, background), shape (k, m + len ψ + 1 + q)."""
+        lag, relative = fitted.scaled.lag(fitted.shape, self.s)
+        driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
+        response = fitted.numerator @ driven
+        by_dynamics = self._in_time(np.concatenate([driven[1:], relative * response])).T
+        return np.column_stack([fitted.gain * by_dynamics, self._in_time(response), self._fixed])
 
 
 def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
@@ -134,20 +170,29 @@ class Projection:
 class Fit:
     """A fitted structure.
 
-    shape: ψ;  numerator: scaled, (m+1,), numerator[0] = 1;  gain: of the probe per motion
+    shape: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
     background: coefficients (q,);  residual: (k,) [m]
     """
 
     scaled: Scaled
     shape: FloatArray
-    numerator: FloatArray
-    gain: float
+    driven: FloatArray
     background: FloatArray
     residual: FloatArray
 
     @property
     def structure(self) -> Structure:
         return self.scaled.structure
+
+    @property
+    def gain(self) -> float:
+        """Of the probe per motion at rest."""
+        return float(self.driven[0])
+
+    @property
+    def numerator(self) -> FloatArray:
+        """Scaled, (m+1,), numerator[0] = 1."""
+        return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
 
     @property
     def samples(self) -> int:
@@ -198,11 +243,8 @@ def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) ->
     if len(best):
         best = _descend(cache, scaled, best, _FINISH_EVALUATIONS)
     at = cache.at(best)
-    zeros = structure.zeros
-    gain = float(at.linear[0])
-    return Fit(
-        scaled, best, at.linear[: zeros + 1] / gain, gain, at.linear[zeros + 1 :], at.residual
-    )
+    terms = len(at.linear) - problem.background.shape[1]
+    return Fit(scaled, best, at.linear[:terms], at.linear[terms:], at.residual)
 
 
 def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int) -> FloatArray:

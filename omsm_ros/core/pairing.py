@@ -24,7 +24,7 @@ from omsm_ros.core.sequence import COUNTER_SPAN
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
-STAMP_TOLERANCE_S = 1.0
+STAMP_TOLERANCE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,30 +158,33 @@ class Pairing:
 
     def _order(self, a: Run, d: Run) -> int:
         """-1: the axes' head has no partner; 1: the distance's; 0: both begin with a pair."""
-        link = self._link
-        if a.session == link.axes or d.session == link.distance:
-            if a.session != link.axes:
-                return 1
-            if d.session != link.distance:
-                return -1
-            return _sign(a.first - (d.first + link.shift))
-        return self._introduce(a, d)
-
-    def _introduce(self, a: Run, d: Run) -> int:
-        """Compare heads of sessions that have not met; link them if they share a trigger."""
-        shift = round((a.first - d.first) / COUNTER_SPAN) * COUNTER_SPAN
-        begin = max(a.first, d.first + shift)
-        lead_ns = a.stamp_of(begin) - d.stamp_of(begin - shift)
-        apart = abs(lead_ns) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
-        if begin < min(a.end, d.end + shift):
-            if apart:
-                return _sign(lead_ns)
-            self._link = _Link(a.session, d.session, shift)
+        if (a.session, d.session) != (self._link.axes, self._link.distance):
+            shift = round((a.first - d.first) / COUNTER_SPAN) * COUNTER_SPAN
+            if _apart(a, d, shift):
+                return self._older(a, d)
+            if _overlap(a, d, shift):
+                self._link = _Link(a.session, d.session, shift)
             return _sign(a.first - (d.first + shift))
-        begun_ns = a.stamp_ns - d.stamp_ns
-        if abs(begun_ns) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S:
-            return _sign(begun_ns)
-        return _sign(a.first - (d.first + shift))
+        return _sign(a.first - (d.first + self._link.shift))
+
+    def _older(self, a: Run, d: Run) -> int:
+        """Which of two heads that cannot be of one session is left over from before."""
+        if a.session == self._link.axes:
+            return -1
+        if d.session == self._link.distance:
+            return 1
+        return _sign(a.stamp_ns - d.stamp_ns) or -1
+
+
+def _apart(a: Run, d: Run, shift: int) -> bool:
+    """True if one trigger count would have had two different times."""
+    count = max(a.first, d.first + shift)
+    lead_ns = a.stamp_of(count) - d.stamp_of(count - shift)
+    return abs(lead_ns) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
+
+
+def _overlap(a: Run, d: Run, shift: int) -> bool:
+    return max(a.first, d.first + shift) < min(a.end, d.end + shift)
 
 
 def _sign(value: float) -> int:

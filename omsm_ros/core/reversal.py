@@ -21,17 +21,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from scipy import linalg
 
 from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.records import FloatArray, SurfacePoints
+from omsm_ros.core.records import FloatArray, IntArray, SurfacePoints
+from omsm_ros.core.transfer_function import ComplexArray
 from omsm_ros.errors import DataError
 
 DEFAULT_DEGREE = 8
 _ITERATIONS = 20
 _CONVERGED_S = 1e-9
-# Residuals are correlated along the path; groups this many must not be fewer.
-_MIN_GROUPS = 20
-_GROUP_SAMPLES = 200
+# Residuals are taken as correlated along the path within groups of so many points.
+_GROUP_POINTS = 200
+_MIN_POINTS = 20 * _GROUP_POINTS
+# More would not fit into memory comfortably; the others are left out evenly.
+_MAX_POINTS = 150_000
 # A surface whose azimuthal slope gives less than this is no test of a lag.
 _MAX_UNCERTAINTY_S = 0.1
 
@@ -66,8 +70,8 @@ def sideways_lag(
     path = _Path.of(scans, calibration.sample_period)
     lag, jacobian, residual = 0.0, np.empty((0, 0)), np.empty(0)
     for _ in range(_ITERATIONS):
-        surface, slope = path.design(lag, degree)
-        jacobian, residual = _without_nuisance(surface, slope, path, lag)
+        surface, slopes = path.design(lag, degree)
+        jacobian, residual = _without_nuisance(surface, slopes, path)
         square = float(jacobian @ jacobian)
         if square == 0:
             raise DataError(_NO_SLOPE)
@@ -106,60 +110,61 @@ def delay_uncertainty(calibration: Calibration) -> float:
         gradient[1] = -1 / g.numerator[0]
     if n:
         gradient[m + 1] = 1.0
-    return float(np.sqrt(max(gradient @ calibration.covariance @ gradient, 0.0)))
+    variance = float(gradient @ calibration.covariance @ gradient)
+    return float(np.sqrt(max(variance, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """All points: positions and velocities as complex numbers in units of ``radius``."""
+    """All points: positions and velocities as x + jy in units of the largest radius, (n,)."""
 
-    position: FloatArray
-    velocity: FloatArray
+    position: ComplexArray
+    velocity: ComplexArray
     height: FloatArray
-    scan: FloatArray
+    scan: IntArray
     pistons: FloatArray
-    radius: float
 
     @classmethod
     def of(cls, scans: Sequence[SurfacePoints], period: float) -> _Path:
         if len(scans) < 2:
             raise DataError(f"{len(scans)} scan, expected one in each spindle direction")
-        parts = [_moving(points, period) for points in scans]
+        every = -(-sum(map(len, scans)) // _MAX_POINTS)
+        parts = [_moving(points, period, every) for points in scans]
         turns = [float(np.sum(np.imag(np.conj(p) * v))) for p, v, _ in parts]
         if not min(turns) < 0 < max(turns):
             raise DataError("both scans turn the same way; reverse the spindle for one of them")
-        position, velocity, height = (np.concatenate(values) for values in zip(*parts, strict=True))
-        radius = float(max(abs(position)))
+        position: ComplexArray = np.concatenate([p for p, _, _ in parts])
+        velocity: ComplexArray = np.concatenate([v for _, v, _ in parts])
+        height = np.concatenate([h for _, _, h in parts])
+        radius = np.complex128(np.max(abs(position)))
         scan = np.repeat(np.arange(len(scans)), [len(p) for p, _, _ in parts])
         pistons = (scan[:, np.newaxis] == np.arange(1, len(scans))).astype(np.float64)
-        return cls(position / radius, velocity / radius, height, scan, pistons, radius)
+        return cls(position / radius, velocity / radius, height, scan, pistons)
 
     def design(self, lag: float, degree: int) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
         """Terms of the surface (n, k) where the points were ``lag`` ago, and of its slopes."""
         earlier = self.position - lag * self.velocity
         # Just beyond the rim, so that a point shifted outwards stays inside the basis.
         x, y = earlier.real / 1.05, earlier.imag / 1.05
-        ex, ey = np.array(
-            [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-        ).T
-        tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
+        ex, ey = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]).T
+        tx, ty = (np.asarray(chebyshev.chebvander(v, degree), np.float64) for v in (x, y))
         dx, dy = _derivative_vander(tx, degree), _derivative_vander(ty, degree)
         along_x = dx[:, ex] * ty[:, ey] / 1.05
         along_y = tx[:, ex] * dy[:, ey] / 1.05
         return tx[:, ex] * ty[:, ey], (along_x, along_y)
 
 
-def _moving(points: SurfacePoints, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, velocity (complex) and height where the points are consecutive."""
-    if len(points) < _MIN_GROUPS * _GROUP_SAMPLES:
-        raise DataError(
-            f"scan of {len(points)} points, expected {_MIN_GROUPS * _GROUP_SAMPLES} or more"
-        )
+def _moving(
+    points: SurfacePoints, period: float, every: int
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Position, velocity and height of every so many points, where they are consecutive."""
+    if len(points) < _MIN_POINTS:
+        raise DataError(f"scan of {len(points)} points, expected {_MIN_POINTS} or more")
     position = points.x + 1j * points.y
     apart = points.sample[2:] - points.sample[:-2]
     velocity = (position[2:] - position[:-2]) / (apart * period)
-    consecutive = apart == 2
-    return position[1:-1][consecutive], velocity[consecutive], points.height[1:-1][consecutive]
+    used = np.flatnonzero(apart == 2)[::every]
+    return position[1:-1][used], velocity[used], points.height[1:-1][used]
 
 
 def _derivative_vander(vander: FloatArray, degree: int) -> FloatArray:
@@ -171,22 +176,26 @@ def _derivative_vander(vander: FloatArray, degree: int) -> FloatArray:
 
 
 def _without_nuisance(
-    surface: FloatArray, slopes: tuple[FloatArray, FloatArray], path: _Path, lag: float
+    surface: FloatArray, slopes: tuple[FloatArray, FloatArray], path: _Path
 ) -> tuple[FloatArray, FloatArray]:
     """What is left of the lag's trace and of the heights once surface and pistons are fitted."""
-    nuisance = np.concatenate([surface, path.pistons], axis=1)
-    basis, _ = np.linalg.qr(nuisance)
-    residual = path.height - basis @ (basis.T @ path.height)
-    terms = np.linalg.lstsq(nuisance, path.height, rcond=None)[0][: surface.shape[1]]
-    velocity = path.velocity
-    trace = -(velocity.real * (slopes[0] @ terms) + velocity.imag * (slopes[1] @ terms))
-    return trace - basis @ (basis.T @ trace), residual
+    terms = np.concatenate([surface, path.pistons], axis=1)
+    # The basis is close to orthogonal, so the normal equations lose no digits that matter.
+    normal = linalg.cho_factor(terms.T @ terms)
+
+    def fitted(values: FloatArray) -> FloatArray:
+        return np.asarray(linalg.cho_solve(normal, terms.T @ values), np.float64)
+
+    shares = fitted(path.height)
+    of_surface, velocity = shares[: surface.shape[1]], path.velocity
+    trace = -(velocity.real * (slopes[0] @ of_surface) + velocity.imag * (slopes[1] @ of_surface))
+    return trace - terms @ fitted(trace), path.height - terms @ shares
 
 
-def _grouped_uncertainty(trace: FloatArray, residual: FloatArray, scan: FloatArray) -> float:
+def _grouped_uncertainty(trace: FloatArray, residual: FloatArray, scan: IntArray) -> float:
     """Standard uncertainty of the lag, residuals being correlated within groups of samples."""
     change = np.flatnonzero(np.diff(scan)) + 1
-    group = np.arange(len(scan)) // _GROUP_SAMPLES
+    group = np.arange(len(scan)) // _GROUP_POINTS
     edges = np.union1d(np.flatnonzero(np.diff(group)) + 1, change)
     scores = np.add.reduceat(trace * residual, np.r_[0, edges])
     correction = len(scores) / (len(scores) - 1)

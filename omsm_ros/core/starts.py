@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.hankel import HankelVote
-from omsm_ros.core.output_error import Fit, Problem, close_period
+from omsm_ros.core.output_error import Fit, Problem
 from omsm_ros.core.records import FloatArray
 from omsm_ros.core.structure import Scaled, Structure
 from omsm_ros.core.transfer_function import ComplexArray, ascending_roots
@@ -25,8 +25,6 @@ _GUESSED_ANGLE = 2.0
 # Of the whole lag, the part first given to a delay where there are poles too.
 _KEPT_DELAY = 0.3
 _LINEAR_ITERATIONS = 8
-# In units of the rate: beyond it the motion has nothing but the encoder's noise.
-_HIGHEST_FREQUENCY = 30.0
 # An added pole begins fast enough not to be seen, and slow enough to have a gradient.
 _ADDED_POLE = -10.0
 
@@ -45,7 +43,7 @@ class StartingPoints:
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
         """Shapes of ``structure``, given the fits made so far."""
         scaled = Scaled(structure, self.problem.rate)
-        delay = float(self.pure_delay.shape[0])
+        delay = float(self.pure_delay.shape[-1]) if self.pure_delay.structure.delay else 0.0
         if structure.poles == 0:
             return [self.pure_delay.shape]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
@@ -59,35 +57,35 @@ class StartingPoints:
         return found
 
     @cached_property
-    def _spectra(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Scaled s, motion, and probe without background, at the frequencies of use."""
+    def _probe(self) -> ComplexArray:
+        """Spectrum of what was seen, without background, lost samples taken from the motion."""
         problem, lag = self.problem, self.pure_delay
-        seen = (problem.seen - problem.background @ lag.background) / lag.gain
-        filled = np.where(problem.used, seen, problem.motion)
-        motion, probe = (
-            np.fft.rfft(close_period(values, problem.period))
-            for values in (problem.motion, np.asarray(filled))
-        )
-        s = problem.scaled_frequencies()
-        used = slice(1, int(np.searchsorted(s.imag, _HIGHEST_FREQUENCY)))
-        return s[used], motion[used], probe[used]
+        seen = problem.seen - problem.background @ lag.background
+        filled = np.where(problem.used, seen, lag.gain * problem.motion)
+        return problem.closed_spectrum(np.asarray(filled))
 
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:
         """Poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
-        s, motion, probe = self._spectra
-        delayed = motion * np.exp(-delay * s)
-        ups = s[:, np.newaxis] ** np.arange(structure.zeros + 1) * delayed[:, np.newaxis]
-        downs = -(s[:, np.newaxis] ** np.arange(1, structure.poles + 1)) * probe[:, np.newaxis]
-        every = np.concatenate([downs, ups], axis=1)
+        # At s = 0 only the background is decided; there, and at the end, s may be extreme.
+        inside = slice(1, max(len(self.problem.s) - 1, 2))
+        s, probe = self.problem.s[inside, np.newaxis], self._probe[inside]
+        downs = -(s ** np.arange(1, structure.poles + 1)) * probe[:, np.newaxis]
+        ups = [
+            s ** np.arange(count) * (spectrum[inside, np.newaxis] * np.exp(-delay * s))
+            for spectrum, count in self.problem.drives(structure)
+        ]
+        every = np.concatenate([downs, *ups], axis=1)
         poles = np.full(structure.poles, -1.0, np.complex128)
         for _ in range(_LINEAR_ITERATIONS):
-            weight = 1 / np.abs(np.prod(1 - s[:, np.newaxis] / poles, axis=1))
+            weight = 1 / np.abs(np.prod(1 - s / poles, axis=1))
             columns = every * weight[:, np.newaxis]
             columns = np.concatenate([columns.real, columns.imag])
             scale = np.linalg.norm(columns, axis=0)
+            scale[scale == 0] = 1.0
             target = np.concatenate([(probe * weight).real, (probe * weight).imag])
             solved = np.linalg.lstsq(columns / scale, target, rcond=None)[0] / scale
-            found = _stable(ascending_roots(np.concatenate([np.ones(1), solved[: structure.poles]])))
+            denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
+            found = _stable(ascending_roots(denominator))
             if len(found) != structure.poles:
                 break
             poles = found

@@ -7,6 +7,7 @@ chirp, a scan) has no edges; it identifies as well, by its own content.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -104,26 +105,26 @@ def _edges(z: FloatArray, moving: BoolArray) -> tuple[Edge, ...]:
     bounds = np.concatenate([[0], np.ravel(np.column_stack([starts, stops])), [len(z)]])
     levels = [
         float(np.mean(z[a:b])) if b > a else float(z[min(a, len(z) - 1)])
-        for a, b in zip(bounds[::2], bounds[1::2])
+        for a, b in zip(bounds[::2], bounds[1::2], strict=True)
     ]
     return tuple(
         Edge(int(start), int(stop), levels[i + 1] - levels[i])
-        for i, (start, stop) in enumerate(zip(starts, stops))
+        for i, (start, stop) in enumerate(zip(starts, stops, strict=True))
         if start > 0 and stop < len(z)
     )
 
 
 def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]]:
-    """The record cut midway between edges, one edge a piece; ``least`` equal parts if there are few."""
+    """The record cut midway between edges, one edge a piece.
+
+    With fewer than ``least`` edges it is cut into twice as many equal parts instead.
+    """
     if len(steps.edges) >= least:
-        middles = [
-            (before.stop + after.start) // 2
-            for before, after in zip(steps.edges, steps.edges[1:])
-        ]
+        middles = [(before.stop + after.start) // 2 for before, after in pairwise(steps.edges)]
         cuts = [0, *middles, samples]
     else:
         cuts = [round(samples * i / (2 * least)) for i in range(2 * least + 1)]
-    return list(zip(cuts[:-1], cuts[1:]))
+    return list(pairwise(cuts))
 
 
 def held_out(steps: Steps, samples: int) -> BoolArray:
@@ -132,6 +133,22 @@ def held_out(steps: Steps, samples: int) -> BoolArray:
     for start, stop in segments(steps, samples)[1::3]:
         mask[start:stop] = True
     return mask
+
+
+def backlash_columns(steps: Steps, samples: int) -> FloatArray:
+    """Direction of the last move (n, 1 or 2), and a mark of the time before the first.
+
+    A play of b shifts what the probe sees by ±b/2 with the direction of approach.
+    """
+    if not steps.edges:
+        return np.empty((samples, 0))
+    direction = np.zeros(samples)
+    for edge in steps.edges:
+        direction[edge.start :] = np.sign(edge.height)
+    if np.all(direction[steps.edges[0].start :] == direction[-1]):
+        return np.empty((samples, 0))
+    before = (np.arange(samples) < steps.edges[0].start).astype(np.float64)
+    return np.column_stack([direction, before])
 
 
 def check_usable(record: MotionRecord) -> None:

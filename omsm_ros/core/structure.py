@@ -108,9 +108,9 @@ class Scaled:
 
     def transfer_function(self, shape: FloatArray, numerator: FloatArray) -> TransferFunction:
         """G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
-        denominator = np.ones(1)
+        denominator: FloatArray = np.ones(1)
         for section in self.sections(shape):
-            denominator = polynomial.polymul(denominator, section)
+            denominator = np.asarray(polynomial.polymul(denominator, section), np.float64)
         return TransferFunction(
             numerator / self.rate ** np.arange(len(numerator)),
             denominator / self.rate ** np.arange(len(denominator)),
@@ -127,13 +127,11 @@ class Scaled:
         jacobian[1 : zeros + 1, :zeros] = np.eye(zeros)
         sections = self.sections(shape)
         for column in range(poles):
-            pair, power = (
-                (column, 1) if column < len(sections) else (column - len(sections), 2)
-            )
-            product = np.zeros(power + 1)
+            pair, power = (column, 1) if column < len(sections) else (column - len(sections), 2)
+            product: FloatArray = np.zeros(power + 1)
             product[power] = sections[pair][power]
             for other in sections[:pair] + sections[pair + 1 :]:
-                product = polynomial.polymul(product, other)
+                product = np.asarray(polynomial.polymul(product, other), np.float64)
             jacobian[zeros + 1 : zeros + len(product), zeros + column] = product[1:]
         if self.structure.delay:
             jacobian[-1, -1] = 1.0

@@ -15,14 +15,17 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.discretise import DigitalFilter, bilinear
+from omsm_ros.core.discretise import DigitalFilter, discretise
 from omsm_ros.core.records import FloatArray, SurfacePoints
 from omsm_ros.core.surface import Surface
+from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.units import MICROMETRE_M
 
 # A direction of the covariance that adds less than this share of the variance is left out.
 _NEGLIGIBLE = 1e-6
+# Sensitivities are derivatives of the motion: each costs one order of the interpolation.
+_ORDER = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,21 +119,33 @@ def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> Sur
 
 
 def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[DigitalFilter]:
-    """Filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none if the covariance is zero.
-
-    The pure delay is left out of them: it moves the variance by that fraction of a sample.
-    """
-    denominator = calibration.dynamics.denominator
-    square = np.asarray(polynomial.polymul(denominator, denominator), np.float64)
+    """Filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none if the covariance is zero."""
+    g = calibration.dynamics
+    square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
     combined = sensitivity_numerators(calibration)
     band = 2j * np.pi * np.linspace(0.0, calibration.valid_up_to, 64)
     power = np.abs(polynomial.polyval(band, combined.T)) ** 2
     share = power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny)
     return [
-        bilinear(numerator, square, sample_period)
+        differentiable(numerator, square, g.delay, sample_period)
         for numerator, largest in zip(combined, share.max(axis=1), strict=True)
         if largest > _NEGLIGIBLE
     ]
+
+
+def differentiable(
+    numerator: FloatArray, denominator: FloatArray, delay: float, sample_period: float
+) -> DigitalFilter:
+    """A filter for a ratio whose numerator may exceed the denominator by one degree.
+
+    Such a ratio, the derivative of a response that does not fall, gets a pole above the
+    Nyquist frequency: below a tenth of it that is 1 % of magnitude.
+    """
+    used = np.trim_zeros(numerator, "b")
+    if len(used) > len(denominator):
+        above_nyquist = np.array([1.0, sample_period / 4])
+        denominator = np.asarray(polynomial.polymul(denominator, above_nyquist), np.float64)
+    return discretise(TransferFunction(used, denominator, delay), sample_period, _ORDER)
 
 
 def sensitivity_numerators(calibration: Calibration) -> FloatArray:

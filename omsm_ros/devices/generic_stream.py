@@ -100,9 +100,9 @@ class Run:
 class SequenceTracker:
     """Frames with a wrapping u32 sequence → runs of an unwrapped trigger counter.
 
-    The same sequence and device time again is a duplicate. A sequence that falls back, or a
-    device time that falls back, is a restarted device, whose own number counts from
-    there. Anything else that is not the next number is a gap.
+    The same sequence and device time again is a duplicate. Where either of them falls back,
+    the device was restarted and its own number counts from there. Anything else that is not
+    the next number is a gap.
     """
 
     def __init__(self) -> None:

@@ -6,6 +6,8 @@ SI, all labels carry the unit they are drawn in.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
@@ -81,10 +83,11 @@ def _draw_map(
     axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)
     style.quiet(axes)
     low, high = limits or _symmetric(raster)
+    left, right, bottom, top = (edge / MILLIMETRE_M for edge in raster.extent)
     image = axes.imshow(
         raster.image / scale,
         origin="lower",
-        extent=tuple(edge / MILLIMETRE_M for edge in raster.extent),
+        extent=(left, right, bottom, top),
         cmap=style.MAP_COLOURS,
         vmin=low / scale,
         vmax=high / scale,
@@ -136,7 +139,7 @@ def profile(
     return made
 
 
-def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: object) -> None:
+def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: Any) -> None:
     gap = np.diff(drawn.position, prepend=drawn.position[0])
     breaks = np.flatnonzero(gap > _BREAK_AT_GAPS * np.median(gap))
     position = np.insert(drawn.position, breaks, np.nan)
@@ -225,7 +228,7 @@ def overview_figure(
     raw, corrected: deviations (n,) [m] at x, y [m]
     """
     made = style.empty(13.0, 3.75)
-    left, middle, right = made.subfigures(1, 3, width_ratios=(1.0, 1.0, 1.0))
+    left, middle, right = made.subfigures(1, 3, squeeze=False)[0]
     _draw_map(left, rasterise(x, y, raw), "µm", "Uncorrected, in micrometres")
     _draw_map(middle, rasterise(x, y, corrected), "nm", "Corrected, in nanometres")
     places = {"left": 0.16, "right": 0.97, "bottom": 0.13, "top": 0.895, "hspace": 0.12}

@@ -62,14 +62,19 @@ def _height_maps(cloud: CloudView) -> dict[str, bytes]:
     return {
         "height_map": style.png(
             figures.deviation_map(
-                cloud.x, cloud.y, height,
-                unit="µm", title="Height [µm]", limits=limits, quantity="above the lowest point",
+                *(cloud.x, cloud.y, height),
+                unit="µm",
+                title="Height [µm]",
+                limits=limits,
+                quantity="above the lowest point",
             )
         ),
         "error_map": style.png(
             figures.deviation_map(
-                cloud.x, cloud.y, cloud.dynamic_error,
-                unit="µm", title="Dynamic error [µm]", quantity="dynamic error",
+                *(cloud.x, cloud.y, cloud.dynamic_error),
+                unit="µm",
+                title="Dynamic error [µm]",
+                quantity="dynamic error",
             )
         ),
     }

@@ -118,7 +118,7 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     if form:
         value = quantity(form["rms_area_weighted"], "m")
         detail = f"peak to valley {quantity(form['peak_to_valley'], 'm')}"
-        found.append(Headline("Deviation from nominal, rms", value, detail))
+        found.append(Headline("Deviation from nominal, rms by area", value, detail))
     before = part(summary, "dynamic_error_before")
     if before:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))
@@ -163,7 +163,8 @@ def _records(report: Report) -> list[tables.Table]:
         found.append(tables.calibration_table(report.calibration))
         found.append(tables.remarks_table(report.calibration))
         found.append(tables.mapping_table("Settings calibrated for", report.calibration.settings))
-    found.append(tables.mapping_table("Settings", part(summary, "settings") or {}))
+    settings = part(summary, "settings") or {}
+    if report.calibration is None or settings != dict(report.calibration.settings):
+        found.append(tables.mapping_table("Settings", settings))
     found.append(tables.mapping_table("Versions", part(summary, "versions") or {}))
     return [table for table in found if table.rows]
-

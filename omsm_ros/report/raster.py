@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from omsm_ros.core.records import FloatArray
+from omsm_ros.core.records import FloatArray, IntArray
 from omsm_ros.errors import DataError
 
 MAX_PIXELS = 400
@@ -16,8 +16,9 @@ _POINTS_PER_PIXEL = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Raster:
-    """Means on square pixels: ``image`` (rows along y, columns along x), NaN where no point is near.
+    """Means on square pixels.
 
+    image: (rows along y, columns along x), NaN where no point is near
     extent: left, right, bottom, top of the image [m]
     """
 
@@ -39,14 +40,16 @@ def rasterise(x: FloatArray, y: FloatArray, value: FloatArray) -> Raster:
     column, columns = _pixel(x, pitch)
     row, rows = _pixel(y, pitch)
     index = row * columns + column
-    count = np.bincount(index, minlength=rows * columns).reshape(rows, columns).astype(np.float64)
-    total = np.bincount(index, value, rows * columns).reshape(rows, columns)
+    count, total = (
+        np.asarray(np.bincount(index, each, rows * columns), np.float64).reshape(rows, columns)
+        for each in (None, value)
+    )
     left, bottom = float(x.min()), float(y.min())
     extent = (left, left + columns * pitch, bottom, bottom + rows * pitch)
     return Raster(_close_gaps(total, count), extent)
 
 
-def _pixel(position: FloatArray, pitch: float) -> tuple[np.ndarray, int]:
+def _pixel(position: FloatArray, pitch: float) -> tuple[IntArray, int]:
     number = np.floor((position - position.min()) / pitch).astype(np.int64)
     # The largest coordinate lies on the outer edge of the last pixel.
     count = max(int(np.ceil(np.ptp(position) / pitch - 1e-9)), 1)

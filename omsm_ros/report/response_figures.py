@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,6 +19,7 @@ from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLISECOND_S, NANOMETRE_M
 
 _LOWEST_HZ = 0.1
 _NM_PER_UM = MICROMETRE_M / NANOMETRE_M
+_SMALLEST_SHOWN_NM_PER_UM = 1e-4
 
 
 def frequencies(identified: Calibration) -> FloatArray:
@@ -99,22 +102,24 @@ def _draw_error(
 ) -> None:
     fitted = identified.dynamics.response(frequency)
     reference = fitted if true is None else true.response(frequency)
-    before = np.abs(1 - reference) * _NM_PER_UM
+
+    def shown(error: FloatArray) -> FloatArray:
+        return np.maximum(error * _NM_PER_UM, _SMALLEST_SHOWN_NM_PER_UM)
+
+    before = shown(np.abs(1 - reference))
+    axes.set_yscale("log")
     axes.plot(frequency, before, color=style.BEFORE, linewidth=1.4, label="uncorrected")
     band = _band(identified, frequency)
     bound = COVERAGE_FACTOR * np.hypot(band.gain, band.phase) * np.abs(fitted)
-    floor = before.min() * 1e-4
     if np.any(bound > 0):
-        axes.fill_between(
-            frequency, floor, np.maximum(bound * _NM_PER_UM, floor),
-            color=style.AFTER, alpha=0.18, linewidth=0, label="corrected, 95 % bound",
-        )  # fmt: skip
+        floor = np.full_like(frequency, _SMALLEST_SHOWN_NM_PER_UM)
+        look: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
+        label = "corrected, 95 % bound"
+        axes.fill_between(frequency, floor, shown(bound), label=label, **look)
     if true is not None:
-        rest = np.abs(fitted - reference) * _NM_PER_UM
+        rest = shown(np.abs(fitted - reference))
         axes.plot(frequency, rest, color=style.AFTER, linewidth=1.4, label="corrected, true")
-        floor = max(floor, 10.0 ** np.floor(np.log10(max(np.median(rest), 1e-300)) - 2))
-    axes.set_yscale("log")
-    axes.set_ylim(max(floor, 1e-4), before.max() * 3)
+    axes.set_ylim(_SMALLEST_SHOWN_NM_PER_UM, max(before.max() * 3, 1.0))
     _frequency_axis(axes, frequency, identified)
     style.legend_above(axes)
     style.label(axes, x="frequency of the motion [Hz]", y="error per motion [nm/µm]")
@@ -150,48 +155,41 @@ def step_response(
     probe: FloatArray,
     predicted: FloatArray | None = None,
 ) -> Figure:
-    """The first of the steepest edges of a step test, each array (n,) [m], and how far the probe is from it.
+    """One of the steepest edges of a step test, and how far the probe is from it.
+
+    Each array is of shape (n,), positions in [m].
 
     time: [s];  encoder: position of the carriage
     probe: motion the probe saw, -distance / static gain on a fixed target, in any offset
     predicted: encoder through the identified G_m
     """
-    lengths = {len(part) for part in (time, encoder, probe)}
+    given = [part for part in (time, encoder, probe, predicted) if part is not None]
+    lengths = {len(part) for part in given}
     if len(lengths) != 1 or len(time) < 3:
         raise DataError(f"step response of {sorted(lengths)!r} samples, expected one length of 3+")
     window = _steepest(time, encoder)
     made, axes = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
     upper, lower = axes[:, 0]
-    offset = encoder[window][0]
-    since = (time[window] - time[window][_start(encoder[window])]) / MILLISECOND_S
-    seen = probe - np.median((probe - encoder)[window])
-    curves = [(encoder, style.MUTED, "carriage (encoder)", "-"), (seen, style.BEFORE, "probe", "-")]
-    for value, colour, text, dashes in curves:
-        upper.plot(
-            since, (value[window] - offset) / MICROMETRE_M, dashes,
-            color=colour, linewidth=1.4, label=text,
-        )  # fmt: skip
-    _draw_error_of_edge(lower, since, (seen - encoder)[window], style.BEFORE, "probe − carriage")
+    edge = encoder[window]
+    since = (time[window] - time[window][_start(edge)]) / MILLISECOND_S
+    seen = probe[window] - np.median(probe[window] - edge)
+
+    def draw(where: Axes, value: FloatArray, colour: str, text: str, line: Any = "-") -> None:
+        where.plot(since, value, color=colour, linewidth=1.3, linestyle=line, label=text)
+
+    draw(upper, (edge - edge[0]) / MICROMETRE_M, style.MUTED, "carriage (encoder)")
+    draw(upper, (seen - edge[0]) / MICROMETRE_M, style.BEFORE, "probe")
+    draw(lower, (seen - edge) / NANOMETRE_M, style.BEFORE, "probe − carriage")
     if predicted is not None:
-        left = (seen - predicted)[window]
-        dashes = (0, (3, 2))
-        upper.plot(
-            since, (predicted[window] - offset) / MICROMETRE_M,
-            color=style.AFTER, linewidth=1.2, linestyle=dashes, label="carriage through $G_m$",
-        )  # fmt: skip
-        _draw_error_of_edge(lower, since, left, style.AFTER, "probe − carriage through $G_m$")
+        model, name = predicted[window], "carriage through $G_m$"
+        draw(upper, (model - edge[0]) / MICROMETRE_M, style.AFTER, name, (0, (3, 2)))
+        draw(lower, (seen - model) / NANOMETRE_M, style.AFTER, f"probe − {name}")
     style.label(upper, y="motion [µm]", title="Step response")
     style.label(lower, x="time since the edge [ms]", y="error [nm]")
     style.legend_above(upper)
     style.legend_above(lower)
     made.align_ylabels()
     return made
-
-
-def _draw_error_of_edge(
-    axes: Axes, since: FloatArray, error: FloatArray, colour: str, text: str
-) -> None:
-    axes.plot(since, error / NANOMETRE_M, color=colour, linewidth=1.2, label=text)
 
 
 def _steepest(time: FloatArray, encoder: FloatArray) -> slice:

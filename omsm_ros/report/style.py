@@ -1,4 +1,4 @@
-"""One look for all figures: quiet axes, colours that the colour-blind tell apart, no global state."""
+"""One look for all figures: quiet axes, colours that everybody can tell apart, no global state."""
 
 from __future__ import annotations
 
@@ -73,13 +73,24 @@ def legend_above(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """A legend without a frame around it."""
-    look = {"fontsize": TEXT_PT, "labelcolor": INK, "framealpha": 0.85, "edgecolor": "none"}
-    axes.legend(handlelength=1.8, borderpad=0.2, **look, **options)
+    look: dict[str, Any] = {
+        "fontsize": TEXT_PT,
+        "labelcolor": INK,
+        "framealpha": 0.85,
+        "edgecolor": "none",
+        "handlelength": 1.8,
+        "borderpad": 0.2,
+    }
+    axes.legend(**look, **options)
 
 
-def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> tuple[FloatArray, ...]:
+Envelope = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelope:
     """Time, smallest and largest value of each of ``columns`` stretches: no spike is lost."""
-    starts = np.unique(np.linspace(0, len(value), min(columns, len(value)), endpoint=False).astype(int))
+    cuts = np.linspace(0, len(value), min(columns, len(value)), endpoint=False)
+    starts = np.unique(cuts.astype(np.int64))
     return time[starts], np.minimum.reduceat(value, starts), np.maximum.reduceat(value, starts)
 
 

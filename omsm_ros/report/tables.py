@@ -93,17 +93,21 @@ def sample_table(summary: Mapping[str, object]) -> Table:
 
 def calibration_table(calibration: Calibration) -> Table:
     """What was identified and how well."""
-    certificate = calibration.certificate
-    dynamics = calibration.dynamics
-    gain_uncertainty = certificate.get("static_gain_uncertainty")
-    delay = certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay)
+    certificate, dynamics = calibration.certificate, calibration.dynamics
+    gain = _with_uncertainty(calibration.static_gain, certificate.get("static_gain_uncertainty"))
+    delay = _seconds(
+        certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay),
+        certificate.get("low_frequency_delay_uncertainty_s"),
+    )
     rows = [
         ("verdict", str(certificate.get("verdict", NOTHING))),
         ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
-        ("static gain, probe per encoder", _with_uncertainty(calibration.static_gain, gain_uncertainty)),
-        ("delay of slow motion", _seconds(delay, certificate.get("low_frequency_delay_uncertainty_s"))),
+        ("static gain, probe per encoder", gain),
+        ("delay of slow motion", delay),
         ("chi-square per degree of freedom", _plain(certificate.get("chi_square"))),
         ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
+        ("whiteness of the residual, p", _plain(certificate.get("whiteness_p"))),
+        ("its independence of the motion, p", _plain(certificate.get("independence_p"))),
         ("edges used", count(certificate.get("edges"))),
         ("sample period", quantity(calibration.sample_period, "s")),
     ]

@@ -1,0 +1,9 @@
+"""``omsm``: the offline commands.
+
+Exit status 0: done; 2: bad input, with one line on stderr that says what to do. With
+``--json`` standard output holds one JSON object and nothing else.
+"""
+
+from omsm_ros.cli.main import main
+
+__all__ = ["main"]

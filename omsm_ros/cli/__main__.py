@@ -1,0 +1,7 @@
+"""``python -m omsm_ros.cli``."""
+
+import sys
+
+from omsm_ros.cli.main import main
+
+sys.exit(main())

@@ -1,0 +1,193 @@
+"""Commands around a calibration: plan, identify, verify, compare."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros import offline
+from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
+from omsm_ros.core.calibration import Calibration, verdict_of
+from omsm_ros.core.drift import compare
+from omsm_ros.core.identify import identify
+from omsm_ros.core.step_plan import plan_csv, plan_gcode, plan_steps
+from omsm_ros.files import load_calibration, save_calibration, save_text
+from omsm_ros.units import DEGREE_RAD, MICROSECOND_S, NANOMETRE_M
+
+# ------------------------------------------------------------------------------ identify
+
+
+def _declare_identify(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, help="a step test, or any motion, on a fixed target")
+    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+    sub.add_argument("--order", type=int, default=0, help="number of poles; 0 = choose")
+    sub.add_argument("--input", choices=("encoder", "reference"), default="encoder")
+    sub.add_argument("--duration", type=float, default=0.0, help="seconds to use; 0 = all")
+    sub.add_argument(
+        "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
+    )
+
+
+def _identify(args: argparse.Namespace) -> Facts:
+    with progress_bar("reading", args.json) as progress:
+        motion = offline.motion_of_bag(args.bag, duration=args.duration, progress=progress)
+    calibration = identify(motion, order=args.order, input=args.input, settings=args.settings)
+    save_calibration(args.out, calibration)
+    return calibration_facts(calibration) | {"calibration": str(args.out)}
+
+
+def calibration_facts(calibration: Calibration) -> Facts:
+    """What a calibration says in a few words."""
+    verdict, reasons = verdict_of(calibration)
+    return {
+        "id": calibration.id,
+        "verdict": verdict,
+        "reasons": reasons,
+        "warnings": calibration.certificate.get("warnings", []),
+        "order": len(calibration.dynamics.denominator) - 1,
+        "low_frequency_delay": calibration.dynamics.low_frequency_delay,
+        "static_gain": calibration.static_gain,
+        "valid_up_to": calibration.valid_up_to,
+    }
+
+
+def _show_identify(facts: Facts) -> None:
+    rows = [
+        ("verdict", facts["verdict"]),
+        ("order", str(facts["order"])),
+        ("low-frequency delay", f"{facts['low_frequency_delay'] / MICROSECOND_S:.2f} µs"),
+        ("static gain", f"{facts['static_gain']:.6f}"),
+        ("valid up to", f"{facts['valid_up_to']:.1f} Hz"),
+    ]
+    for kind in ("reasons", "warnings"):
+        rows += [(kind.removesuffix("s"), text) for text in facts[kind]]
+    table([*rows, ("written to", facts["calibration"])])
+
+
+# -------------------------------------------------------------------------------- verify
+
+
+def _declare_verify(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, help="a free path (chirp) on a fixed target")
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
+
+
+def _verify(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("reading", args.json) as progress:
+        check = offline.path_check_of(args.bag, calibration, progress)
+    edges = np.arange(0.0, math.floor(check.frequency.max()) + 1.0)
+    bands = [
+        {
+            "from": float(low),
+            "to": float(low + 1),
+            "error_before": _rms(check.error_before[inside]),
+            "error_after": _rms(check.error_after[inside]),
+            "lag_before": float(np.mean(check.lag_before[inside])),
+            "lag_after": float(np.mean(check.lag_after[inside])),
+        }
+        for low in edges
+        if np.any(inside := (check.frequency >= low) & (check.frequency < low + 1))
+    ]
+    return {"rms_before": check.rms_before, "rms_after": check.rms_after, "bands": bands}
+
+
+def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _show_verify(facts: Facts) -> None:
+    print("    Hz   error before   after        lag before   after")
+    for band in facts["bands"]:
+        before, after = (band[f"error_{w}"] / NANOMETRE_M for w in ("before", "after"))
+        lags = (band[f"lag_{w}"] / DEGREE_RAD for w in ("before", "after"))
+        print(
+            f"{band['from']:3.0f}-{band['to']:<3.0f} {before:8.1f} nm {after:8.1f} nm "
+            + " ".join(f"{lag:10.4f}°" for lag in lags)
+        )
+    before, after = (facts[f"rms_{w}"] / NANOMETRE_M for w in ("before", "after"))
+    print(f"rms    {before:8.1f} nm {after:8.1f} nm")
+
+
+# ------------------------------------------------------------------------------- compare
+
+
+def _declare_compare(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("old", type=Path, metavar="OLD.json")
+    sub.add_argument("new", type=Path, metavar="NEW.json")
+
+
+def _compare(args: argparse.Namespace) -> Facts:
+    change = compare(load_calibration(args.old), load_calibration(args.new))
+    return asdict(change) | {"text": change.text()}
+
+
+# ---------------------------------------------------------------------------------- plan
+
+
+def _declare_plan(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("what", choices=("steps",))
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument("--sample-period", type=positive, default=1e-3, help="of the probe [s]")
+    sub.add_argument("--step", type=positive, default=9.8e-6, help="height of a step [m]")
+    sub.add_argument("--count", type=int, default=10, help="steps up; as many follow down")
+    sub.add_argument("--dwell", type=positive, default=0.5, help="from edge to edge [s]")
+    sub.add_argument("--rise", type=positive, default=20e-3, help="of an edge [s]")
+    sub.add_argument("--half-range", type=positive, default=50e-6, help="of the probe [m]")
+
+
+def _plan(args: argparse.Namespace) -> Facts:
+    plan = plan_steps(
+        sample_period=args.sample_period,
+        step=args.step,
+        count=args.count,
+        dwell=args.dwell,
+        rise=args.rise,
+        half_range=args.half_range,
+    )
+    csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
+    save_text(csv, plan_csv(plan, args.sample_period))
+    save_text(gcode, plan_gcode(plan))
+    return {
+        "edges": len(plan.starts),
+        "duration": plan.duration,
+        "rise": plan.rise,
+        "files": {"csv": str(csv), "gcode": str(gcode)},
+    }
+
+
+def _show_plan(facts: Facts) -> None:
+    table(
+        [
+            ("edges", str(facts["edges"])),
+            ("duration", f"{facts['duration']:g} s"),
+            ("rise", f"{facts['rise'] * 1e3:g} ms, dithered within the sample period"),
+            ("written", ", ".join(facts["files"].values())),
+        ]
+    )
+
+
+CALIBRATING = (
+    Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
+    Command(
+        "identify", "identify G_m from a recording", _declare_identify, _identify, _show_identify
+    ),
+    Command(
+        "verify",
+        "check a calibration on a free path: errors and phase lags before and after",
+        _declare_verify,
+        _verify,
+        _show_verify,
+    ),
+    Command(
+        "compare",
+        "has the machine changed between two calibrations?",
+        _declare_compare,
+        _compare,
+        lambda facts: print(facts["text"]),
+    ),
+)

@@ -1,0 +1,72 @@
+"""What every command is: arguments, an action that returns facts, and a way to print them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from tqdm import tqdm
+
+from omsm_ros.offline import Progress
+
+Facts: TypeAlias = "dict[str, Any]"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One word after ``omsm``.
+
+    declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
+    show: prints the facts for people
+    """
+
+    name: str
+    help: str
+    declare: Callable[[argparse.ArgumentParser], None]
+    act: Callable[[argparse.Namespace], Facts]
+    show: Callable[[Facts], None]
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool) -> Iterator[Progress]:
+    """A bar on stderr that counts messages; silent for programs and in pipes."""
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(desc=title, unit=" messages", leave=False, disable=hidden) as bar:
+
+        def advance(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield advance
+
+
+def json_object(text: str) -> dict[str, object]:
+    """Argument type: a JSON object."""
+    try:
+        value = json.loads(text)
+    except ValueError as err:
+        raise argparse.ArgumentTypeError(f"{text!r} is not JSON: {err}") from err
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
+    return value
+
+
+def positive(text: str) -> float:
+    """Argument type: a positive number."""
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def table(rows: list[tuple[str, str]]) -> None:
+    """Print names and values in two columns."""
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value}")

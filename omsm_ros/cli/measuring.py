@@ -1,0 +1,228 @@
+"""Commands around a scan: inspect, predict, correct, reversal, align."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from omsm_ros import offline
+from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
+from omsm_ros.core.correct import CorrectionOptions
+from omsm_ros.core.kinematics import Geometry
+from omsm_ros.core.predict import DEFAULT_BUDGET_M, predict_error
+from omsm_ros.files import load_calibration, load_geometry, load_surface, save_geometry
+from omsm_ros.measurement import Admission, measure
+from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
+
+_CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
+
+
+def _geometry(path: Path | None) -> Geometry:
+    return load_geometry(path) if path else Geometry()
+
+
+# ------------------------------------------------------------------------------- inspect
+
+
+def _declare_inspect(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path)
+
+
+def _inspect(args: argparse.Namespace) -> Facts:
+    with progress_bar("reading", args.json) as progress:
+        found = offline.inspect_bag(args.bag, progress)
+    return {"bag": str(args.bag), "topics": offline.as_json(found)}
+
+
+def _show_inspect(facts: Facts) -> None:
+    row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
+    names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
+    print(row.format(rate="rate Hz", **{name: name for name in names}))
+    for topic in facts["topics"]:
+        period = topic["sample_period"]
+        print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+
+
+# ------------------------------------------------------------------------------- correct
+
+
+def _declare_correct(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path)
+    sub.add_argument("--calibration", **_CALIBRATION)
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
+    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
+    sub.add_argument("--lateral-lag", type=float, help="of the probe against X and C [s]")
+    sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
+    sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
+    sub.add_argument(
+        "--override", action="store_true", help="use a calibration that does not belong; recorded"
+    )
+
+
+def _correct(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    nominal = load_surface(args.nominal) if args.nominal else None
+    options = CorrectionOptions(
+        polarity=args.polarity,
+        accept_other_rate=args.override,
+        lateral_lag=args.lateral_lag,
+        geometry=_geometry(args.geometry),
+    )
+    with progress_bar("correcting", args.json) as progress:
+        return measure(
+            args.bag,
+            calibration,
+            args.out,
+            nominal=nominal,
+            options=options,
+            admission=Admission(args.settings, args.override),
+            progress=progress,
+        )
+
+
+def _show_correct(summary: Facts) -> None:
+    rows = []
+    for stream, account in summary["samples"].items():
+        reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
+        text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
+        rows.append((stream, text))
+    rows += [("warning", text) for text in summary.get("warnings", [])]
+    table([*rows, ("written", ", ".join(summary["files"].values()))])
+
+
+# ------------------------------------------------------------------------------- predict
+
+
+def _declare_predict(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, help="a recorded motion")
+    sub.add_argument("--calibration", **_CALIBRATION)
+    sub.add_argument(
+        "--budget", type=positive, default=DEFAULT_BUDGET_M, help="allowed residual, k = 2 [m]"
+    )
+
+
+def _predict(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("reading", args.json) as progress:
+        z, period = offline.motion_in(args.bag, progress)
+    return asdict(predict_error(calibration, z, period, args.budget))
+
+
+def _show_predict(facts: Facts) -> None:
+    table(
+        [
+            ("verdict", "safe" if facts["safe"] else "NOT safe"),
+            ("dynamic error", f"{facts['peak_to_valley'] / MICROMETRE_M:.3f} µm PV, "
+                              f"{facts['rms'] / MICROMETRE_M:.3f} µm rms"),
+            ("left after correction", f"{facts['residual'] / NANOMETRE_M:.2f} nm (k = 1)"),
+            ("motion outside the band", f"{100 * facts['outside_band_fraction']:.2g} %"),
+            ("may run faster by", f"{facts['speed_factor']:.3g}"),
+            ("because", facts["message"]),
+        ]
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------ reversal
+
+
+def _declare_reversal(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
+    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
+    sub.add_argument("--calibration", **_CALIBRATION)
+
+
+def _reversal(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("correcting", args.json) as progress:
+        bags = (args.clockwise, args.counterclockwise)
+        return asdict(offline.sideways_lag_of(bags, calibration, progress))
+
+
+_MEANINGS = {
+    True: "the probe is late: X and C must be delayed too (setting lag_is_latency)",
+    False: "the lag is mechanical, in Z only",
+    None: "neither none nor all of the lag of Z; give it with --lateral-lag",
+}
+
+
+def _show_reversal(facts: Facts) -> None:
+    table(
+        [
+            ("sideways lag", f"{facts['lag'] / MICROSECOND_S:.2f} µs "
+                             f"± {facts['uncertainty'] / MICROSECOND_S:.2f} µs (k = 1)"),
+            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
+            ("meaning", _MEANINGS[facts["latency"]]),
+            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
+        ]
+    )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------- align
+
+
+def _declare_align(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, help="a scan of a reference sphere")
+    sub.add_argument("--calibration", **_CALIBRATION)
+    sub.add_argument("--radius", type=float, required=True, help="[m], negative if convex")
+    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="what is known")
+    sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
+
+
+def _align(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    known = _geometry(args.geometry)
+    with progress_bar("correcting", args.json) as progress:
+        found = offline.alignment_of(args.bag, calibration, args.radius, known, progress)
+    save_geometry(args.out, found.geometry)
+    names = ("centre_x", "centre_y", "beam_x", "beam_y")
+    # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.
+    spread = found.uncertainty if found.beam_found else (*found.uncertainty[:2], None, None)
+    return {
+        "geometry": asdict(found.geometry),
+        "uncertainty": dict(zip(names, spread, strict=True)),
+        "residual": found.residual,
+        "beam_found": found.beam_found,
+        "file": str(args.out),
+    }
+
+
+def _show_align(facts: Facts) -> None:
+    rows = []
+    for name, spread in facts["uncertainty"].items():
+        value, length = facts["geometry"][name], name.startswith("centre")
+        unit, text = (MICROMETRE_M, "µm") if length else (1e-3, "mrad")
+        stated = (
+            "not to be seen in this scan" if spread is None else f"± {spread / unit:.4f} {text}"
+        )
+        rows.append((name, f"{value / unit:.4f} {text} {stated}"))
+    rows.append(("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"))
+    table([*rows, ("written to", facts["file"])])
+
+
+MEASURING = (
+    Command("inspect", "show what a bag holds", _declare_inspect, _inspect, _show_inspect),
+    Command(
+        "predict",
+        "what a motion will cost, and how fast it may run",
+        _declare_predict,
+        _predict,
+        _show_predict,
+    ),
+    Command("correct", "correct a recorded scan", _declare_correct, _correct, _show_correct),
+    Command(
+        "reversal",
+        "is the lag latency? From two scans with opposite spindle directions",
+        _declare_reversal,
+        _reversal,
+        _show_reversal,
+    ),
+    Command(
+        "align",
+        "spindle centre and beam direction from a scan of a reference sphere",
+        _declare_align,
+        _align,
+        _show_align,
+    ),
+)

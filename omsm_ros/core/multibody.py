@@ -1,0 +1,245 @@
+"""The machine as masses, springs and dampers: the paper's Eq. 6 to 9, and their fit to a G(s).
+
+Two masses in a chain from the ground: ``m1`` on ``k1, c1``, and ``m2`` on ``m1`` through
+``k2, c2``, driven by a force on ``m1``. Eq. 7 is the motion of ``m2`` (non-collocated); of
+``m1`` itself it is the collocated one. Its printed ``a1 = (k1 + k2) c1`` does not follow
+from the equations of motion, and is unstable for ordinary machines; it is
+``a1 = k1 c2 + k2 c1``. A response says nothing of the scale of masses and stiffnesses
+together, so one of them has to be known: ``m1``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import optimize
+
+from omsm_ros.core.confidence import relative_response_jacobian
+from omsm_ros.core.records import FloatArray
+from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.errors import DataError, IdentificationError
+
+_LINES = 200
+
+
+@dataclass(frozen=True)
+class TwoMass:
+    """m1, m2 [kg];  k1, k2 [N/m];  c1, c2 [N·s/m]; all positive."""
+
+    m1: float
+    m2: float
+    k1: float
+    k2: float
+    c1: float
+    c2: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise DataError(f"two-mass model: {name} is {value!r}, expected a positive number")
+
+    def _denominator(self) -> list[float]:
+        m1, m2, k1, k2, c1, c2 = self.m1, self.m2, self.k1, self.k2, self.c1, self.c2
+        return [
+            k1 * k2,
+            k1 * c2 + k2 * c1,
+            (m1 + m2) * k2 + m2 * k1 + c1 * c2,
+            (m1 + m2) * c2 + m2 * c1,
+            m1 * m2,
+        ]
+
+    def non_collocated(self) -> TransferFunction:
+        """Eq. 7 scaled to G(0) = 1: the probe's mass, m2."""
+        return TransferFunction.from_ascending([self.k2, self.c2], self._denominator()).normalised()
+
+    def collocated(self) -> TransferFunction:
+        """The driven mass, m1, scaled to G(0) = 1."""
+        numerator = [self.k2, self.c2, self.m2]
+        return TransferFunction.from_ascending(numerator, self._denominator()).normalised()
+
+
+@dataclass(frozen=True)
+class ModalTerm:
+    """One term of Eq. 8: residue α/m [1/s²], undamped frequency [Hz], damping ratio."""
+
+    residue: float
+    frequency: float
+    damping: float
+
+
+def modal_sum(terms: tuple[ModalTerm, ...]) -> TransferFunction:
+    """Eq. 8, ``Σ residue / (s² + 2 ζ ω s + ω²)``; not normalised.
+
+    The print lacks the s behind 2 ζ ω. Raises DataError without terms.
+    """
+    if not terms:
+        raise DataError("a modal sum needs one term or more")
+    multiply, add = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyadd
+    numerator: FloatArray = np.zeros(1)
+    denominator: FloatArray = np.ones(1)
+    for term in terms:
+        omega = 2 * np.pi * term.frequency
+        section = [omega**2, 2 * term.damping * omega, 1.0]
+        added = add(multiply(numerator, section), term.residue * denominator)
+        numerator = np.asarray(added, np.float64)
+        denominator = np.asarray(multiply(denominator, section), np.float64)
+    return TransferFunction.from_ascending(numerator, denominator)
+
+
+def modal_terms(dynamics: TransferFunction) -> tuple[ModalTerm, ...]:
+    """Oscillating modes of G with the real part of their residue as in Eq. 8, slowest first.
+
+    At a pair p, p* the partial fractions are ``r/(s-p) + r*/(s-p*)``; its value at s = 0 is
+    ``-2 Re(r p*)/|p|²``, and the term of Eq. 8 with that value has the residue ``-2 Re(r p*)``.
+    """
+    poles = dynamics.poles()
+    derivative = np.polynomial.polynomial.polyder(dynamics.denominator)
+    found = []
+    for pole in poles[poles.imag > 0]:
+        residue = np.polynomial.polynomial.polyval(
+            pole, dynamics.numerator
+        ) / np.polynomial.polynomial.polyval(pole, derivative)
+        found.append(
+            ModalTerm(
+                float(-2 * np.real(residue * np.conj(pole))),
+                float(abs(pole) / (2 * np.pi)),
+                float(-pole.real / abs(pole)),
+            )
+        )
+    return tuple(sorted(found, key=lambda term: term.frequency))
+
+
+@dataclass(frozen=True, eq=False)
+class TwoMassFit:
+    """model: fitted;  uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
+    misfit: rms of the difference of response in units of its stated uncertainty
+    """
+
+    model: TwoMass
+    uncertainty: FloatArray
+    misfit: float
+
+
+def fit_two_mass(
+    dynamics: TransferFunction,
+    covariance: FloatArray,
+    *,
+    table_mass: float,
+    collocated: bool,
+    frequencies: ArrayLike,
+) -> TwoMassFit:
+    """Masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
+
+    covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty
+    table_mass: m1 [kg], which no response can tell;  frequencies: lines to compare at [Hz]
+
+    Raises IdentificationError when G has fewer than two modes to explain.
+    """
+    lines = np.asarray(frequencies, np.float64)
+    terms = modal_terms(dynamics)
+    if len(terms) < 2:
+        raise IdentificationError(
+            f"the two-mass model needs two oscillating modes, the response has {len(terms)!r}"
+        )
+    target = np.log(dynamics.response(lines))
+    whiten = _whitener(dynamics, covariance, lines)
+
+    def model(logs: FloatArray) -> TwoMass:
+        return TwoMass(table_mass, *(float(v) for v in np.exp(logs)))
+
+    def residual(logs: FloatArray) -> FloatArray:
+        two = model(logs)
+        found = two.collocated() if collocated else two.non_collocated()
+        difference = np.log(found.response(lines)) - target
+        turned = np.angle(np.exp(1j * difference.imag))
+        return np.asarray(whiten * np.concatenate([difference.real, turned]))
+
+    best = min(
+        (
+            optimize.least_squares(residual, start, x_scale="jac")
+            for start in _starts(terms, table_mass)
+        ),
+        key=lambda solution: float(solution.cost),
+    )
+    sensitivity = np.linalg.pinv(best.jac) * whiten
+    spread = sensitivity @ _stacked_jacobian(dynamics, lines)
+    variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
+    return TwoMassFit(
+        model(best.x),
+        np.sqrt(np.maximum(variance, 0.0)),
+        float(np.sqrt(2 * best.cost / len(best.fun))),
+    )
+
+
+def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArray:
+    return relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
+
+
+def _whitener(dynamics: TransferFunction, covariance: FloatArray, lines: FloatArray) -> FloatArray:
+    jacobian = _stacked_jacobian(dynamics, lines)
+    variance = np.einsum("kp,pq,kq->k", jacobian, covariance, jacobian)
+    floor = 1e-6 * float(np.max(variance)) or 1.0
+    return np.asarray(1 / np.sqrt(np.maximum(variance, floor)))
+
+
+def _starts(terms: tuple[ModalTerm, ...], table_mass: float) -> list[FloatArray]:
+    """Uncoupled guesses with either mode belonging to the second mass."""
+    low, high = (2 * np.pi * term.frequency for term in terms[:2])
+    starts = []
+    for ratio in (0.05, 0.2, 0.8):
+        for first, second in ((low, high), (high, low)):
+            m2 = ratio * table_mass
+            k1, k2 = table_mass * first**2, m2 * second**2
+            c1, c2 = 0.05 * np.sqrt(k1 * table_mass), 0.05 * np.sqrt(k2 * m2)
+            starts.append(np.log([m2, k1, k2, c1, c2]))
+    return starts
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a response looks like; Hz, NaN where it has no such point below ``up_to``.
+
+    resonance: of the greatest gain, and that gain;  minimum: of the least gain, and that gain
+    bandwidth_3db: where the gain first leaves 1 by 3 dB;  bandwidth_1_percent: by 1 %
+    """
+
+    resonance: float
+    resonance_gain: float
+    minimum: float
+    minimum_gain: float
+    bandwidth_3db: float
+    bandwidth_1_percent: float
+
+
+def shape(dynamics: TransferFunction, up_to: float) -> Shape:
+    """Read the salient points of |G| below ``up_to`` [Hz]."""
+    frequency = np.geomspace(1e-3 * up_to, up_to, 20 * _LINES)
+    gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
+    highest, lowest = _interior(gain, np.argmax), _interior(gain, np.argmin)
+
+    def point(index: int | None) -> tuple[float, float]:
+        if index is None:
+            return float("nan"), float("nan")
+        return float(frequency[index]), float(gain[index])
+
+    def leaves(inside: float) -> float:
+        outside = np.flatnonzero(np.abs(np.log(gain)) > inside)
+        return float(frequency[outside[0]]) if len(outside) else float("nan")
+
+    return Shape(
+        *point(highest), *point(lowest), leaves(np.log(10 ** (3 / 20))), leaves(-np.log(0.99))
+    )
+
+
+def finite_values(read: Shape) -> dict[str, float | None]:
+    """The fields of ``read`` as JSON values, None for NaN."""
+    return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
+
+
+def _interior(gain: FloatArray, pick: Callable[[FloatArray], np.intp]) -> int | None:
+    """The extreme's place, or None at an end, where it is no extreme."""
+    index = int(pick(gain))
+    return index if 0 < index < len(gain) - 1 else None

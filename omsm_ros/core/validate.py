@@ -1,0 +1,170 @@
+"""Does a fitted model leave anything unexplained? Tests on its residual, and a second method.
+
+The tests of Ljung (1999, ch. 16): a white residual says that the noise is understood, a
+residual independent of the motion says that the dynamics are. The second matters more;
+the covariance allows for coloured noise, but for a missing mode nothing can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, signal, stats
+
+from omsm_ros.core.output_error import Fit, Problem
+from omsm_ros.core.records import BoolArray, FloatArray
+from omsm_ros.core.spectrum import FrequencyResponse
+from omsm_ros.core.step_test import Steps
+from omsm_ros.core.transfer_function import TransferFunction
+
+_LAGS = 25
+# After an edge the response is looked at for this long.
+_AFTER_EDGE_S = 50e-3
+_LEAST_REST_SAMPLES = 200
+
+
+@dataclass(frozen=True)
+class ResidualTests:
+    """chi_square: mean square where the axis moves over that of noise;  noise: [m]
+    whiteness, independence: p-values, small where the residual is coloured or follows the motion
+    """
+
+    chi_square: float
+    noise: float
+    whiteness: float
+    independence: float
+
+
+def residual_tests(
+    problem: Problem, fitted: Fit, steps: Steps, noise: float | None
+) -> ResidualTests:
+    """Tests of the residual of ``fitted``; ``noise`` [m] if known, else taken at rest."""
+    on_grid = np.zeros(len(problem.used))
+    on_grid[problem.used] = fitted.residual
+    active = problem.used & _active(steps, problem.period)
+    rest = problem.used & ~active
+    if noise is None:
+        noise = _noise(on_grid, problem.used, rest)
+    seen_moving = on_grid[active] if np.any(active) else fitted.residual
+    lost = fitted.structure.size
+    chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2
+    return ResidualTests(
+        chi_square,
+        noise,
+        whiteness(fitted.residual),
+        independence(fitted.residual, np.gradient(problem.motion)[problem.used]),
+    )
+
+
+def _active(steps: Steps, period: float) -> BoolArray:
+    after = round(_AFTER_EDGE_S / period)
+    return np.asarray(np.convolve(steps.moving, np.ones(after + 1))[: len(steps.moving)] > 0.5)
+
+
+def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
+    tiny = float(np.finfo(np.float64).tiny)
+    if np.sum(rest) >= _LEAST_REST_SAMPLES:
+        return float(np.std(on_grid[rest])) or tiny
+    # No rest: white noise is what neighbouring samples do not share.
+    return float(np.sqrt(np.mean(np.diff(on_grid[used], 2) ** 2) / 6.0)) or tiny
+
+
+def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
+    """p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
+    n = len(residual)
+    correlation = _correlation(residual, residual, lags)[1:]
+    statistic = n * (n + 2) * np.sum(correlation**2 / (n - np.arange(1, lags + 1)))
+    return float(stats.chi2.sf(statistic, lags))
+
+
+def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> float:
+    """p-value that ``residual`` (k,) does not follow ``drive`` (k,), the motion's rate.
+
+    The residual is regressed on the last ``lags`` values of the drive, which are correlated;
+    so few of its directions count, and only those above rounding are counted.
+    """
+    past = np.column_stack([np.roll(drive, lag) for lag in range(lags)])[lags:]
+    left, values, _ = np.linalg.svd(past, full_matrices=False)
+    basis = left[:, values > 1e-6 * values[0]] if values[0] > 0 else left[:, :0]
+    rest = residual[lags:]
+    statistic = float(np.sum((basis.T @ rest) ** 2)) / float(np.mean(rest**2) or 1.0)
+    return float(stats.chi2.sf(statistic, basis.shape[1])) if basis.shape[1] else 1.0
+
+
+def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
+    size = fft.next_fast_len(len(a) + lags + 1, real=True)
+    cross = fft.irfft(fft.rfft(a, size) * np.conj(fft.rfft(b, size)), size)[: lags + 1]
+    norm = float(np.linalg.norm(a) * np.linalg.norm(b)) or 1.0
+    return np.asarray(cross / norm)
+
+
+@dataclass(frozen=True, eq=False)
+class PathCheck:
+    """The paper's Fig. 9 for one free path, arrays (n,) but the summary.
+
+    frequency: instantaneous [Hz];  error_before, error_after: [m]
+    lag_before, lag_after: of the probe behind the encoder, and behind the model [rad]
+    rms_before, rms_after: [m]
+    """
+
+    frequency: FloatArray
+    error_before: FloatArray
+    error_after: FloatArray
+    lag_before: FloatArray
+    lag_after: FloatArray
+    rms_before: float
+    rms_after: float
+
+
+def check_path(
+    z: FloatArray,
+    distance: FloatArray,
+    predicted: FloatArray,
+    static_gain: float,
+    sample_period: float,
+) -> PathCheck:
+    """Instantaneous error and Hilbert phase lag before and after correction.
+
+    z: encoder [m];  distance: probe on a fixed target [m];  predicted: G_m z [m], all (n,)
+    The probe's own view of the motion is -distance / static_gain, apart from its offset.
+    """
+    seen = -(distance / static_gain)
+    before = _centred(z - seen)
+    after = _centred(predicted - seen)
+    turning = signal.hilbert(_centred(z))
+    phase = np.unwrap(np.angle(turning))
+    return PathCheck(
+        frequency=np.gradient(phase) / (2 * np.pi * sample_period),
+        error_before=before,
+        error_after=after,
+        lag_before=_lag(z, seen),
+        lag_after=_lag(predicted, seen),
+        rms_before=float(np.sqrt(np.mean(before**2))),
+        rms_after=float(np.sqrt(np.mean(after**2))),
+    )
+
+
+def _centred(values: FloatArray) -> FloatArray:
+    return np.asarray(values - np.mean(values))
+
+
+def _lag(ahead: FloatArray, behind: FloatArray) -> FloatArray:
+    ratio = signal.hilbert(_centred(ahead)) * np.conj(signal.hilbert(_centred(behind)))
+    return np.asarray(np.angle(ratio))
+
+
+def response_agreement(
+    dynamics: TransferFunction, measured: FrequencyResponse, up_to: float, gain: float
+) -> float:
+    """Mean square of (measured / gain - G) over its uncertainty, up to ``up_to`` [Hz]; about 1.
+
+    Lines without coherence count for nothing.
+    """
+    good = (measured.frequency > 0) & (measured.frequency <= up_to) & (measured.coherence > 0.5)
+    if not np.any(good):
+        return float("nan")
+    g = dynamics.response(measured.frequency[good])
+    difference = np.abs(measured.response[good] / gain - g) / np.abs(g)
+    floor = np.maximum(measured.uncertainty[good], 1e-9)
+    return float(np.mean((difference / floor) ** 2) / 2)

@@ -1,0 +1,380 @@
+"""Frames to blocks with a scripted transport: every frame counted, every block consecutive."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omsm_ros.core.records import Status
+from omsm_ros.devices.generic_stream import (
+    BlockPair,
+    GenericStreamDevice,
+    SequenceTracker,
+    StreamSettings,
+)
+from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.protocols.generic_stream import (
+    FRAME,
+    AxisScaling,
+    FrameArray,
+    ProbeScaling,
+    StreamScaling,
+    encode_frames,
+)
+
+MS = 1_000_000
+NEVER, AT_ONCE = 1e6, 1e-12  # pauses [s]
+
+
+class Script:
+    """A transport that plays portions; what it has not is silence, an exception is raised."""
+
+    name = "script"
+
+    def __init__(self, *portions: bytes | Exception) -> None:
+        self.portions = list(portions)
+        self.opened = self.closed = 0
+
+    def open(self) -> None:
+        self.opened += 1
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def read(self, timeout: float) -> bytes:
+        portion = self.portions.pop(0) if self.portions else b""
+        if isinstance(portion, Exception):
+            raise portion
+        return portion
+
+    def write(self, data: bytes) -> None:
+        raise AssertionError("this device is never spoken to")
+
+
+def frames_of(sequence: list[int] | np.ndarray, start_ns: int | None = None) -> FrameArray:
+    """Frames 1 ms apart in device time; channel i of sample s holds 10·s + i counts."""
+    numbers = np.asarray(sequence, np.int64)
+    frames = np.zeros(len(numbers), FRAME)
+    frames["sequence"] = numbers % 2**32
+    first = numbers[0] * MS if start_ns is None else start_ns
+    frames["device_time"] = first + (numbers - numbers[0]) * MS
+    frames["distance"] = numbers % 1000
+    frames["counts"] = (10 * numbers)[:, np.newaxis] + np.arange(5)
+    return frames
+
+
+def run(
+    *portions: bytes | Exception, settings: StreamSettings | None = None
+) -> tuple[list[BlockPair], GenericStreamDevice]:
+    """All blocks of a script, the flushed rest included."""
+    device = GenericStreamDevice(Script(*portions), settings or StreamSettings(pause=NEVER))
+    device.open()
+    blocks = [pair for _ in portions for pair in device.poll(0.0)]
+    blocks += device.close()
+    assert_consistent(blocks, device)
+    return blocks, device
+
+
+def assert_consistent(blocks: list[BlockPair], device: GenericStreamDevice) -> None:
+    found = device.statistics
+    assert found.frames == found.delivered + found.pending + found.duplicates
+    assert found.delivered == sum(len(axes) for axes, _ in blocks)
+    assert found.blocks == len(blocks)
+    for axes, distance in blocks:
+        assert len(axes) == len(distance)
+        assert (axes.stamp_ns, axes.first_sample, axes.sample_period) == (
+            distance.stamp_ns,
+            distance.first_sample,
+            distance.sample_period,
+        )
+    stamps = [axes.stamp_ns for axes, _ in blocks]
+    assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
+
+
+def spans(blocks: list[BlockPair]) -> list[tuple[int, int]]:
+    """First sample and length of each block."""
+    return [(axes.first_sample, len(axes)) for axes, _ in blocks]
+
+
+# --- blocks -----------------------------------------------------------------------------
+
+
+def test_values_reach_their_fields() -> None:
+    settings = StreamSettings(
+        pause=NEVER,
+        scaling=StreamScaling(
+            x=AxisScaling(10.0),
+            y=AxisScaling(10.0, sign=-1),
+            z=AxisScaling(10.0, offset=7.0),
+            b=AxisScaling(2.0),
+            c=AxisScaling(5.0),
+            probe=ProbeScaling(polarity=-1),
+        ),
+    )
+    ((axes, distance),), _ = run(encode_frames(frames_of([3, 4])), settings=settings)
+    np.testing.assert_allclose(axes.x, [3.0, 4.0])
+    np.testing.assert_allclose(axes.y, [-3.1, -4.1])
+    np.testing.assert_allclose(axes.z, [10.2, 11.2])
+    np.testing.assert_allclose(axes.b, [16.5, 21.5])
+    np.testing.assert_allclose(axes.c, [6.8, 8.8])
+    np.testing.assert_allclose(distance.distance, [-3e-9, -4e-9])
+    assert distance.status.tolist() == [Status.OK, Status.OK]
+    assert (axes.first_sample, axes.sample_period) == (3, 1e-3)
+
+
+@given(st.integers(1, 400), st.integers(1, 130), st.lists(st.integers(0, 25_000)))
+def test_any_portions_give_the_same_blocks(count: int, size: int, cuts: list[int]) -> None:
+    wire = encode_frames(frames_of(np.arange(5, 5 + count)))
+    edges = sorted({0, len(wire), *(c for c in cuts if c < len(wire))})
+    portions = [wire[a:b] for a, b in itertools.pairwise(edges)]
+    blocks, device = run(*portions, settings=StreamSettings(block_size=size, pause=NEVER))
+    full, rest = divmod(count, size)
+    assert [len(axes) for axes, _ in blocks] == [size] * full + [rest] * (rest > 0)
+    samples = np.concatenate([axes.first_sample + np.arange(len(axes)) for axes, _ in blocks])
+    np.testing.assert_array_equal(samples, np.arange(5, 5 + count))
+    x = np.concatenate([axes.x for axes, _ in blocks])
+    np.testing.assert_allclose(x, samples * 1e-9, rtol=1e-12)
+    assert device.statistics.lost == 0
+
+
+def test_a_pause_hands_over_the_partial_block() -> None:
+    settings = StreamSettings(block_size=100, pause=AT_ONCE)
+    device = GenericStreamDevice(Script(encode_frames(frames_of(np.arange(130)))), settings)
+    device.open()
+    assert spans(device.poll(0.0)) == [(0, 100)]
+    assert device.statistics.pending == 30
+    assert spans(device.poll(0.0)) == [(100, 30)]
+    assert device.poll(0.0) == []
+    assert device.close() == []
+
+
+def test_no_pause_keeps_it_waiting() -> None:
+    device = GenericStreamDevice(
+        Script(encode_frames(frames_of([0, 1]))), StreamSettings(pause=NEVER)
+    )
+    device.open()
+    assert device.poll(0.0) == device.poll(0.0) == []
+    assert spans(device.close()) == [(0, 2)]
+
+
+def test_noise_alone_counts_as_a_pause() -> None:
+    script = Script(encode_frames(frames_of([0, 1])), b"\xaa\x00")
+    device = GenericStreamDevice(script, StreamSettings(pause=AT_ONCE))
+    device.open()
+    assert device.poll(0.0) == []
+    assert spans(device.poll(0.0)) == [(0, 2)]
+
+
+# --- sequence ---------------------------------------------------------------------------
+
+
+def test_a_gap_closes_the_block_and_is_counted() -> None:
+    blocks, device = run(encode_frames(frames_of([0, 1, 2, 7, 8, 20])))
+    assert spans(blocks) == [(0, 3), (7, 2), (20, 1)]
+    assert (device.statistics.lost, device.statistics.gaps) == (15, 2)
+
+
+def test_a_broken_frame_is_a_gap_of_one() -> None:
+    wire = bytearray(encode_frames(frames_of(np.arange(10))))
+    wire[4 * 63 + 20] ^= 0x80
+    blocks, device = run(bytes(wire))
+    assert spans(blocks) == [(0, 4), (5, 5)]
+    found = device.statistics
+    assert found.lost == found.bad_crc + found.bad_cobs == 1
+
+
+def test_duplicates_are_left_out_and_counted() -> None:
+    frames = frames_of([0, 1, 2, 3])[[0, 1, 1, 1, 2, 3, 3]]
+    blocks, device = run(encode_frames(frames[:3]), encode_frames(frames[3:]))
+    assert spans(blocks) == [(0, 4)]
+    assert (device.statistics.duplicates, device.statistics.lost) == (3, 0)
+
+
+def test_a_portion_of_duplicates_only() -> None:
+    frames = frames_of([0, 1])
+    blocks, device = run(encode_frames(frames), encode_frames(frames[[1, 1]]))
+    assert spans(blocks) == [(0, 2)]
+    assert device.statistics.duplicates == 2
+
+
+def test_the_sequence_wraps_and_the_counter_does_not() -> None:
+    blocks, device = run(encode_frames(frames_of(np.arange(2**32 - 3, 2**32 + 4))))
+    assert spans(blocks) == [(2**32 - 3, 7)]
+    assert device.statistics.lost == device.statistics.restarts == 0
+    blocks, device = run(encode_frames(frames_of([2**32 - 2, 2**32 + 1, 2 * 2**32 - 9])[:2]))
+    assert spans(blocks) == [(2**32 - 2, 1), (2**32 + 1, 1)]
+    assert device.statistics.lost == 2
+
+
+@pytest.mark.parametrize("first", [0, 3, 149, 150])
+def test_a_restarted_device_counts_from_its_own_number(first: int) -> None:
+    """Also where its first number happens to be the last, or the next, of before."""
+    before = frames_of(np.arange(100, 150), start_ns=10**12)
+    after = frames_of(np.arange(first, first + 20), start_ns=0)
+    blocks, device = run(encode_frames(before) + encode_frames(after))
+    assert spans(blocks) == [(100, 50), (first, 20)]
+    found = device.statistics
+    assert (found.restarts, found.lost, found.duplicates) == (1, 0, 0)
+
+
+def test_a_number_that_falls_back_is_a_restart_even_if_the_clock_went_on() -> None:
+    before = frames_of(np.arange(100, 150), start_ns=0)
+    after = frames_of(np.arange(0, 20), start_ns=10**12)
+    blocks, device = run(encode_frames(before), encode_frames(after))
+    assert spans(blocks) == [(100, 50), (0, 20)]
+    assert device.statistics.restarts == 1
+
+
+def test_the_same_number_at_a_later_time_is_a_restart_too() -> None:
+    blocks, device = run(
+        encode_frames(frames_of(np.arange(7, 10), start_ns=0)),
+        encode_frames(frames_of([9, 10], start_ns=10**12)),
+    )
+    assert spans(blocks) == [(7, 3), (9, 2)]
+    found = device.statistics
+    assert (found.restarts, found.duplicates, found.lost) == (1, 0, 0)
+
+
+@given(
+    st.lists(
+        st.one_of(st.just(1), st.just(1), st.integers(0, 5), st.integers(2, 2**31 - 1)),
+        min_size=1,
+        max_size=60,
+    ),
+    st.integers(0, 2**32 - 1),
+    st.data(),
+)
+def test_tracker_agrees_with_plain_counting(
+    steps: list[int], start: int, data: st.DataObject
+) -> None:
+    """Against the definition, one frame at a time; portions as they come."""
+    numbers = np.cumsum([start, *steps])
+    frames = frames_of(numbers)
+    cuts = sorted({0, len(frames), *data.draw(st.lists(st.integers(0, len(frames))))})
+    tracker = SequenceTracker()
+    runs = [r for a, b in itertools.pairwise(cuts) for r in tracker.split(frames[a:b])]
+    seen = np.concatenate([r.first_sample + np.arange(len(r.frames)) for r in runs])
+    np.testing.assert_array_equal(seen, np.unique(numbers))
+    assert tracker.duplicates == len(numbers) - len(np.unique(numbers))
+    assert tracker.lost == numbers[-1] - numbers[0] + 1 - len(np.unique(numbers))
+    assert tracker.gaps == sum(step > 1 for step in steps)
+    assert tracker.restarts == 0
+
+
+# --- values that need memory ------------------------------------------------------------
+
+
+def test_a_wrapping_encoder_is_unwrapped_across_blocks_and_gaps() -> None:
+    turns = AxisScaling(3600 / (2 * np.pi), wrap=3600)
+    angle = np.linspace(0.3, 40.0, 300)
+    frames = frames_of(np.arange(300))
+    frames["counts"][:, 4] = turns.counts(angle)
+    kept = np.delete(frames, np.arange(120, 125))
+    settings = StreamSettings(block_size=50, pause=NEVER, scaling=StreamScaling(c=turns))
+    blocks, _ = run(encode_frames(kept), settings=settings)
+    found = np.concatenate([axes.c for axes, _ in blocks])
+    expected = np.delete(angle, np.arange(120, 125))
+    assert abs(found - expected).max() <= np.pi / 3600 * 1.001
+
+
+def test_unknown_verdicts_are_counted_and_lost() -> None:
+    frames = frames_of(np.arange(4))
+    frames["status"] = [0, 9, 1, 200]
+    ((_, distance),), device = run(encode_frames(frames))
+    assert distance.status.tolist() == [
+        Status.OK,
+        Status.LOST,
+        Status.NO_TARGET,
+        Status.LOST,
+    ]
+    assert device.statistics.unknown_status == 2
+
+
+# --- time -------------------------------------------------------------------------------
+
+
+def test_stamps_are_of_the_first_sample_on_the_host_clock() -> None:
+    """Frames that arrive at the instant they are taken: host = device + a known offset."""
+    offset = 1_700_000_000_000_000_000
+    wire = [encode_frames(frames_of([i])) for i in range(40)]
+    arrivals = iter(i * MS + offset for i in range(40))
+    device = GenericStreamDevice(
+        Script(*wire), StreamSettings(block_size=10, pause=NEVER), lambda: next(arrivals)
+    )
+    device.open()
+    blocks = [pair for _ in wire for pair in device.poll(0.0)]
+    assert [axes.stamp_ns - offset for axes, _ in blocks] == [0, 10 * MS, 20 * MS, 30 * MS]
+
+
+def test_stamps_of_a_restarted_device_are_of_its_new_clock() -> None:
+    """Up for a day, then again from zero: host time goes on as if nothing had been."""
+    day = 86_400 * 1000 * MS
+    before = frames_of(np.arange(10), start_ns=day)
+    after = frames_of(np.arange(10), start_ns=0)
+    arrivals = iter([9 * MS, 2009 * MS])
+    device = GenericStreamDevice(
+        Script(encode_frames(before), encode_frames(after)),
+        StreamSettings(block_size=10, pause=NEVER),
+        lambda: day + next(arrivals),
+    )
+    device.open()
+    blocks = device.poll(0.0) + device.poll(0.0)
+    assert [axes.stamp_ns - day for axes, _ in blocks] == [0, 2000 * MS]
+
+
+@pytest.mark.parametrize(
+    ("deviation", "warnings"), [(0.0, 0), (90e-6, 0), (-90e-6, 0), (110e-6, 3), (-0.01, 3)]
+)
+def test_a_wrong_nominal_period_is_noticed(deviation: float, warnings: int) -> None:
+    frames = frames_of(np.arange(330))
+    frames["device_time"] = np.rint(np.arange(330) * MS * (1 + deviation))
+    _, device = run(encode_frames(frames))
+    assert device.statistics.period_warnings == warnings
+    assert device.statistics.period_deviation == pytest.approx(deviation, abs=1e-8)
+
+
+# --- connection -------------------------------------------------------------------------
+
+
+def test_the_constructor_touches_nothing() -> None:
+    script = Script()
+    GenericStreamDevice(script)
+    assert script.opened == 0
+
+
+def test_a_lost_connection_costs_nothing_that_had_arrived() -> None:
+    wire = encode_frames(frames_of(np.arange(12)))
+    device = GenericStreamDevice(
+        Script(wire[: 5 * 63 + 30], DeviceError("gone"), wire[7 * 63 :]),
+        StreamSettings(pause=NEVER),
+    )
+    device.open()
+    assert device.poll(0.0) == []
+    with pytest.raises(DeviceError, match="gone"):
+        device.poll(0.0)
+    blocks = device.close()
+    device.open()
+    device.poll(0.0)
+    blocks += device.close()
+    assert spans(blocks) == [(0, 5), (7, 5)]
+    assert_consistent(blocks, device)
+    found = device.statistics
+    assert (found.lost, found.gaps, found.bad_length) == (2, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"sample_period": 0.0}, r"sample_period 0\.0"),
+        ({"pause": -1.0}, r"pause -1\.0"),
+        ({"block_size": 0}, "block_size 0"),
+        ({"block_size": 10**7}, "block_size 10000000"),
+    ],
+)
+def test_senseless_settings_are_refused(arguments: dict[str, float], named: str) -> None:
+    with pytest.raises(ConfigurationError, match=named):
+        StreamSettings(**arguments)
