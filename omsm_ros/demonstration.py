@@ -21,7 +21,7 @@ from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import load_calibration, read_ply
+from omsm_ros.files import load_calibration, open_ply
 from omsm_ros.report import response_figures, style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.figures import overview_figure
@@ -121,14 +121,14 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
     account = offline.correct_bag(plan.bag, calibration, plan.out / measurement.CLOUD)
-    cloud = read_ply(plan.out / measurement.CLOUD)
+    cloud = open_ply(plan.out / measurement.CLOUD)
     view = measurement.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
-    summary = measurement.summarise(plan.bag, account, view, calibration, PAPER_MIRROR)
+    summary = measurement.summarise(plan.bag, account, cloud, calibration, PAPER_MIRROR)
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
-    summary |= truth_entries(recording, cloud)
+    summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
     summary["response"] = response_errors(calibration, Plant().dynamics)
     summary["live_equals_offline"] = same_points(live_points(plan.bag), cloud)
     index = cloud["sample"].astype(np.int64)

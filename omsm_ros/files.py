@@ -173,19 +173,25 @@ class PlyWriter:
         self._file.__exit__(kind, error, trace)
 
 
-def read_ply(path: Path | str) -> NDArray[np.void]:
-    """Points of our own ``cloud.ply`` as a structured array (n,) of the contract's fields."""
-    raw = Path(path).read_bytes()
-    head, mark, body = raw.partition(b"end_header\n")
-    if not raw.startswith(b"ply\n") or not mark:
-        raise FileError(f"{str(path)!r} is not a PLY file")
+def open_ply(path: Path | str) -> NDArray[np.void]:
+    """Points of our own ``cloud.ply``: a structured array (n,), read from disk as it is used.
+
+    Raises FileError if it is no cloud of ours, or was cut short.
+    """
+    path = Path(path)
+    with path.open("rb") as stream:
+        head, mark, _ = stream.read(_PLY_HEADER_BYTES).partition(b"end_header\n")
+    if not head.startswith(b"ply\n") or not mark:
+        raise FileError(f"{str(path)!r} is not a PLY file of ours")
     count = next(
         (int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element vertex")),
         -1,
     )
-    if count < 0 or len(body) != count * _PLY_DTYPE.itemsize:
+    if path.stat().st_size != _PLY_HEADER_BYTES + count * _PLY_DTYPE.itemsize:
         raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
-    return np.frombuffer(body, _PLY_DTYPE)
+    if not count:
+        return np.empty(0, _PLY_DTYPE)
+    return np.memmap(path, _PLY_DTYPE, mode="r", offset=_PLY_HEADER_BYTES)
 
 
 # ----------------------------------------------------------- surface, geometry, summary

@@ -18,15 +18,20 @@ from omsm_ros.core import form
 from omsm_ros.core.applicability import admit, objections
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.correct import CorrectionOptions
-from omsm_ros.core.records import FloatArray
+from omsm_ros.core.predict import predict_error
 from omsm_ros.core.surface import Surface
 from omsm_ros.errors import DataError
-from omsm_ros.files import read_ply, save_json, whole_file
+from omsm_ros.files import open_ply, save_json, whole_file
 from omsm_ros.report import style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.gallery import surface_figures
 from omsm_ros.report.page import Report, render
 from omsm_ros.report.response_figures import bode
+
+# Bound the memory whatever the length of a scan.
+_MOST_DRAWN = 1_000_000
+_PORTION = 500_000
+_MOST_JUDGED = 2_000_000
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 
@@ -67,10 +72,11 @@ def measure(
     account = offline.correct_bag(
         bag, calibration, out / CLOUD, options=options, comment=comment, progress=progress
     )
-    view = view_of(read_ply(out / CLOUD), period)
-    summary = summarise(bag, account, view, calibration, nominal)
+    cloud = open_ply(out / CLOUD)
+    summary = summarise(bag, account, cloud, calibration, nominal)
     summary["admission"] = admitted
     summary["warnings"] += [f"overridden: {reason}" for reason in reasons]
+    view = view_of(cloud, period)
     figures = surface_figures(view, nominal) if view is not None else {}
     figures["bode"] = style.png(bode(calibration, None, period))
     publish(out, f"Surface of {bag.name}", summary, calibration, figures)
@@ -78,12 +84,15 @@ def measure(
 
 
 def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
-    """Columns of a cloud for the report; None if it has no points.
+    """Columns of a cloud for the figures; None if it has no points.
 
-    Without the dynamic correction its height would be ``raw_height``.
+    A cloud of more than a million points is thinned evenly: no picture has so many pixels,
+    and all numbers come from all points. Without the dynamic correction its height would be
+    ``raw_height``.
     """
     if not len(cloud):
         return None
+    cloud = cloud[:: -(-len(cloud) // _MOST_DRAWN)]
     sample = cloud["sample"].astype(np.int64)
     error = cloud["dynamic_error"].astype(np.float64)
     return CloudView(
@@ -100,7 +109,7 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
 def summarise(
     bag: Path,
     account: Mapping[str, Any],
-    view: CloudView | None,
+    cloud: NDArray[np.void],
     calibration: Calibration,
     nominal: Surface | None,
 ) -> dict[str, Any]:
@@ -118,41 +127,52 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY, "report": REPORT},
     }
-    summary["warnings"] = _warnings(bag, calibration, view)
-    if view is None:
-        return summary
-    weights = form.spiral_weights(view.x, view.y)
-    removed = form.statistics(view.dynamic_error - np.mean(view.dynamic_error), weights)
-    summary["dynamic_error_before"] = {
-        "peak_to_valley": removed.peak_to_valley,
-        "rms": removed.rms_area_weighted,
-    }
-    summary["uncertainty"] = {
-        "median": float(np.median(view.uncertainty)),
-        "largest": float(np.max(view.uncertainty)),
-    }
-    if nominal is not None:
-        summary["deviation"] = _deviation(view, nominal, weights)
-    return summary
+    summary["warnings"] = _warnings(bag, calibration, len(cloud))
+    return summary | _figures_of_merit(cloud, nominal)
 
 
-def _warnings(bag: Path, calibration: Calibration, view: CloudView | None) -> list[str]:
-    if view is None:
+def _warnings(bag: Path, calibration: Calibration, points: int) -> list[str]:
+    if not points:
         return ["not one sample could be corrected; see the reasons"]
     try:
-        prediction = offline.predict_from(calibration, str(bag), np.empty(0), 0.0)
+        z, period = offline.motion_in(bag, most=_MOST_JUDGED)
+        prediction = predict_error(calibration, z, period)
     except DataError as err:
         return [f"the motion could not be judged: {err}"]
     return [] if prediction.safe else [prediction.message]
 
 
-def _deviation(view: CloudView, nominal: Surface, weights: FloatArray) -> dict[str, Any]:
-    found = {}
-    for name, height in (("raw", view.raw_height), ("corrected", view.height)):
-        error = form.deviation(view.x, view.y, height, nominal)
-        levelled = form.level(view.x, view.y, error, weights=weights)
-        found[name] = asdict(form.statistics(levelled, weights))
+def _figures_of_merit(cloud: NDArray[np.void], nominal: Surface | None) -> dict[str, Any]:
+    if not len(cloud):
+        return {}
+    running = {name: form.RunningStatistics() for name in ("error", "raw", "corrected")}
+    largest = 0.0
+    for start in range(0, len(cloud), _PORTION):
+        part = cloud[start : start + _PORTION]
+        x, y, height, error = (
+            part[name].astype(np.float64) for name in ("x", "y", "height", "dynamic_error")
+        )
+        largest = max(largest, float(part["uncertainty"].max()))
+        running["error"].add(x, y, error)
+        if nominal is not None:
+            deviation = form.deviation(x, y, height, nominal)
+            running["corrected"].add(x, y, deviation)
+            running["raw"].add(x, y, deviation + error)
+    removed = running["error"].statistics()
+    spread = {"peak_to_valley": removed.peak_to_valley, "rms": removed.rms_area_weighted}
+    found: dict[str, Any] = {
+        "dynamic_error_before": spread,
+        "uncertainty": {"median": _median(cloud["uncertainty"]), "largest": largest},
+    }
+    if nominal is not None:
+        found["deviation"] = {
+            name: asdict(running[name].statistics()) for name in ("raw", "corrected")
+        }
     return found
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    return float(np.median(values[:: -(-len(values) // _MOST_DRAWN)]))
 
 
 def publish(

@@ -195,13 +195,23 @@ def _bridged(record: MotionRecord) -> FloatArray:
 # ------------------------------------------------------------------------------- preview
 
 
-def motion_in(path: Path, progress: Progress = no_progress) -> tuple[FloatArray, float]:
-    """Z of a bag [m] and its sample period [s]."""
-    blocks = read_blocks(path, [bags.AXES_TOPIC], progress)[bags.AXES_TOPIC]
-    if not blocks:
+def motion_in(
+    path: Path, progress: Progress = no_progress, most: int | None = None
+) -> tuple[FloatArray, float]:
+    """Z of a bag [m], its first ``most`` samples (None = all), and its sample period [s]."""
+    found: list[FloatArray] = []
+    samples, period = 0, 0.0
+    with bags.BagReader(path) as bag:
+        total = bag.count([bags.AXES_TOPIC])
+        for done, (_, block) in enumerate(bag.records(bags.AXES_TOPIC), start=1):
+            found.append(block.z)
+            samples, period = samples + len(block), block.sample_period
+            progress(done, total)
+            if most is not None and samples >= most:
+                break
+    if not found:
         raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
-    z = np.concatenate([b.z for b in blocks if isinstance(b, AxisBlock)])
-    return z, blocks[0].sample_period
+    return np.concatenate(found)[:most], period
 
 
 def predict_from(

@@ -105,9 +105,13 @@ def test_a_block_that_contradicts_itself_is_refused(tmp_path, small_scan_blocks)
 
 
 def test_an_interrupted_recording_leaves_no_file(tmp_path, small_scan_blocks):
-    with pytest.raises(KeyboardInterrupt), bags.BagWriter(tmp_path / "a.mcap", TOPICS) as writer:
-        writer.write_axes(small_scan_blocks[0][0])
-        raise KeyboardInterrupt
+    def interrupted():
+        with bags.BagWriter(tmp_path / "a.mcap", TOPICS) as writer:
+            writer.write_axes(small_scan_blocks[0][0])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert list(tmp_path.iterdir()) == []
 
 

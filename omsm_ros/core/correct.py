@@ -19,7 +19,7 @@ from omsm_ros.core.account import Account, Reason, Tally
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.discretise import DEFAULT_ORDER
 from omsm_ros.core.kinematics import Geometry, workpiece_points
-from omsm_ros.core.motion_filter import MotionFilter, MotionFilters
+from omsm_ros.core.motion_filter import ABSURD, MotionFilter, MotionFilters
 from omsm_ros.core.pairing import Pairing, Run
 from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray, SurfacePoints
 from omsm_ros.core.sequence import Admission, Sequence
@@ -85,6 +85,7 @@ class Corrector:
         self._noise_gain = 1.0
         self._variance: defaultdict[str, float] = defaultdict(float)
         self._ready: list[SurfacePoints] = []
+        self._stamp_skew: float | None = None
 
     def push_axes(self, block: AxisBlock) -> None:
         """Filter the encoder's samples of a block.
@@ -92,8 +93,7 @@ class Corrector:
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
         motion = self._filter_for(block)
-        self._axes_tally.received += len(block)
-        admission = _admit(self._axes_sequence, block, len(block), self._axes_tally)
+        admission = _admit(self._axes_sequence, block, self._axes_tally)
         if admission.skip < len(block):
             for run in motion.push(_axes_run(block, admission)):
                 self._pairing.axes.push(run)
@@ -106,8 +106,7 @@ class Corrector:
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
         self._filter_for(block)
-        self._distance_tally.received += len(block)
-        admission = _admit(self._distance_sequence, block, len(block), self._distance_tally)
+        admission = _admit(self._distance_sequence, block, self._distance_tally)
         if admission.skip < len(block):
             self._pairing.distance.push(_distance_run(block, admission))
             self._join()
@@ -144,6 +143,14 @@ class Corrector:
             axes=self._axes_tally.snapshot(self._pairing.axes.pending + warming),
             distance=self._distance_tally.snapshot(self._pairing.distance.pending),
         )
+
+    @property
+    def stamp_skew(self) -> float | None:
+        """Time of the axes minus time of the distance for the newest common trigger [s].
+
+        Large or drifting, it tells of devices that count different triggers.
+        """
+        return self._stamp_skew
 
     @property
     def budget(self) -> dict[str, float]:
@@ -183,6 +190,7 @@ class Corrector:
 
     def _join(self) -> None:
         for axes, distance in self._pairing.pairs():
+            self._stamp_skew = (axes.stamp_ns - distance.stamp_ns) / NANOSECONDS_PER_S
             points = self._points(axes, distance)
             if len(points):
                 self._ready.append(points)
@@ -235,8 +243,9 @@ def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
     return max(calibration.dynamics.low_frequency_delay, 0.0) if stated else 0.0
 
 
-def _admit(sequence: Sequence, block: Block, length: int, tally: Tally) -> Admission:
-    admission = sequence.admit(block, length)
+def _admit(sequence: Sequence, block: AxisBlock | DistanceBlock, tally: Tally) -> Admission:
+    admission = sequence.admit(block, len(block))
+    tally.received += len(block)
     tally.count(Reason.LATE, admission.late)
     tally.count(Reason.DUPLICATE, admission.skip - admission.late)
     return admission
@@ -249,7 +258,8 @@ def _axes_run(block: AxisBlock, admission: Admission) -> Run:
 
 def _distance_run(block: DistanceBlock, admission: Admission) -> Run:
     intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
-    reasons = np.where(block.ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
+    usable = block.ok & (abs(block.distance) < ABSURD)
+    reasons = np.where(usable, Reason.NONE, Reason.INVALID).astype(np.uint8)
     return _run(block, admission, reasons, np.array([block.distance, intensity], np.float64))
 
 

@@ -134,6 +134,48 @@ def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
     )
 
 
+class RunningStatistics:
+    """Statistics of a cloud that comes in portions, its piston removed as by :func:`level`.
+
+    Weights are radii, as for :func:`spiral_weights`. Exact up to rounding: sums are taken
+    about the first value, for a deviation is small against its stand-off.
+    """
+
+    def __init__(self) -> None:
+        self._points = 0
+        self._start = 0.0
+        self._least, self._most = np.inf, -np.inf
+        # Of weight 1 and of weight radius: Σw, Σw d, Σw d².
+        self._sums = np.zeros((2, 3))
+
+    def add(self, x: FloatArray, y: FloatArray, deviation: FloatArray) -> None:
+        """Take in a portion, each array (n,) [m]."""
+        _check(x=x, y=y, deviation=deviation)
+        if not self._points:
+            self._start = float(deviation[0])
+        shifted = deviation - self._start
+        for row, weight in zip(self._sums, (np.ones_like(x), np.hypot(x, y)), strict=True):
+            weighted = weight * shifted
+            row += weight.sum(), weighted.sum(), weighted @ shifted
+        self._points += len(x)
+        self._least = min(self._least, float(shifted.min()))
+        self._most = max(self._most, float(shifted.max()))
+
+    def statistics(self) -> FormStatistics:
+        """Of all portions so far. Raises DataError if there was none, or all lie at the centre."""
+        (count, plain, plain_square), (total, weighted, weighted_square) = self._sums
+        if not total > 0:
+            raise DataError(f"{self._points} points, none of them off the spindle axis")
+        piston = weighted / total
+        mean_square = (plain_square - 2 * piston * plain) / count + piston**2
+        return FormStatistics(
+            peak_to_valley=self._most - self._least,
+            rms=float(np.sqrt(max(mean_square, 0.0))),
+            rms_area_weighted=float(np.sqrt(max(weighted_square / total - piston**2, 0.0))),
+            points=self._points,
+        )
+
+
 def line_profile(
     x: FloatArray,
     y: FloatArray,

@@ -134,7 +134,7 @@ class Spiral:
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """``turns`` turns at constant ``radius`` [m], Z following ``surface``, at ``spindle_speed`` [rpm]."""
+    """``turns`` turns at constant ``radius`` [m] and ``spindle_speed`` [rpm], Z on ``surface``."""
 
     surface: Surface
     radius: float

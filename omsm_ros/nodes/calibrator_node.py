@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
@@ -15,7 +14,7 @@ from omsm_ros.core.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.identify import identify
 from omsm_ros.core.motion_buffer import BlockBuffer
 from omsm_ros.core.motion_record import MotionRecord, assemble
-from omsm_ros.errors import ConfigurationError, OmsmError
+from omsm_ros.errors import OmsmError
 from omsm_ros.files import save_calibration
 from omsm_ros.nodes.running import (
     LATCHED_QOS,
@@ -25,6 +24,7 @@ from omsm_ros.nodes.running import (
     Diagnostics,
     parameter,
     run,
+    settings_of,
 )
 from omsm_ros.offline import motion_of_bag
 
@@ -38,7 +38,7 @@ class CalibratorNode(Node):
         self._output = parameter(
             self, "output", "calibration.json", "where to write the calibration"
         )
-        self._settings = _settings_of(
+        self._settings = settings_of(
             parameter(self, "settings", "{}", "JSON object of what the calibration belongs to")
         )
         self._axes: BlockBuffer = BlockBuffer(capacity)
@@ -126,16 +126,6 @@ class CalibratorNode(Node):
             "blocks_refused": self._refused,
         }
         return OK, self._last, values
-
-
-def _settings_of(text: str) -> dict[str, object]:
-    try:
-        settings = json.loads(text)
-    except ValueError as err:
-        raise ConfigurationError(f"settings {text!r} is not JSON: {err}") from err
-    if not isinstance(settings, dict):
-        raise ConfigurationError(f"settings {text!r} is not a JSON object")
-    return settings
 
 
 def main() -> None:

@@ -13,9 +13,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
 from omsm_ros import conversions
+from omsm_ros.core.applicability import admit, objections
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.cloud import pack_points
 from omsm_ros.core.correct import CorrectionOptions, Corrector
+from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.load import LoadMeter
 from omsm_ros.errors import OmsmError
 from omsm_ros.files import load_calibration
@@ -28,10 +30,14 @@ from omsm_ros.nodes.running import (
     Diagnostics,
     parameter,
     run,
+    settings_of,
 )
 from omsm_ros.offline import predict_from
 
 MessageInfo: TypeAlias = "dict[str, int]"
+
+FRAME, OVERRIDDEN_FRAME = "workpiece", "workpiece_overridden"
+GEOMETRY = ("centre_x", "centre_y", "probe_x", "probe_z", "beam_x", "beam_y", "abbe_arm")
 
 _COMPLAINT_PERIOD_S = 5.0
 
@@ -45,14 +51,26 @@ class CorrectorNode(Node):
         follow = parameter(
             self, "follow_calibrator", True, "take what appears on the calibration topic"
         )
+        self._settings = settings_of(
+            parameter(self, "settings", "{}", "JSON object of how the cell is set now")
+        )
+        self._override = parameter(
+            self, "override", False, "use a calibration that does not belong; every cloud says so"
+        )
         self._options = CorrectionOptions(
             polarity=parameter(
                 self, "polarity", 1, "+1: distance falls as z rises; -1: the other way"
             ),
-            accept_other_rate=parameter(
-                self, "accept_other_rate", False, "use a calibration of another sample rate"
+            accept_other_rate=self._override,
+            lateral_lag=self._lateral_lag(),
+            geometry=Geometry(
+                **{
+                    name: parameter(self, f"geometry.{name}", 0.0, "of the probe [m] or slope")
+                    for name in GEOMETRY
+                }
             ),
         )
+        self._frame = FRAME
         self._messages = conversions.ros_messages()
         self._calibration: Calibration | None = None
         self._corrector: Corrector | None = None
@@ -79,8 +97,20 @@ class CorrectorNode(Node):
 
     # ------------------------------------------------------------------- calibration
 
+    def _lateral_lag(self) -> float | None:
+        lag = parameter(self, "lateral_lag", -1.0, "of the probe [s]; negative = as calibrated")
+        return None if lag < 0 else float(lag)
+
     def _use(self, calibration: Calibration) -> None:
+        reasons = objections(
+            calibration, settings=self._settings or None, polarity=self._options.polarity
+        )
+        admit(calibration, reasons, self._override)
         self._publish_rest()
+        # A viewer that waits for the usual frame shows nothing until somebody has seen why.
+        self._frame = OVERRIDDEN_FRAME if reasons else FRAME
+        for reason in reasons:
+            self.get_logger().warning(f"overridden: {reason}")
         self._calibration = calibration
         self._corrector = Corrector(calibration, self._options)
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
@@ -93,11 +123,10 @@ class CorrectorNode(Node):
     def _on_calibration(self, message: CalibrationMessage) -> None:
         try:
             calibration = conversions.calibration(message)
+            if self._calibration is None or calibration.id != self._calibration.id:
+                self._use(calibration)
         except OmsmError as err:
             self.get_logger().error(f"calibration refused: {err}")
-            return
-        if self._calibration is None or calibration.id != self._calibration.id:
-            self._use(calibration)
 
     def _on_load(
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
@@ -160,7 +189,9 @@ class CorrectorNode(Node):
     def _publish(self, points: object) -> None:
         if points is None or not self.context.ok():
             return
-        cloud = conversions.cloud_message(self._messages, pack_points(points), self._stamp_ns)
+        cloud = conversions.cloud_message(
+            self._messages, pack_points(points), self._stamp_ns, self._frame
+        )
         self._points.publish(cloud)
         self._published += 1
 
@@ -186,6 +217,8 @@ class CorrectorNode(Node):
             counted = account.pop("counted")
             values |= {f"{stream}_{name}": value for name, value in account.items()}
             values |= {f"{stream}_{name}": value for name, value in counted.items()}
+        if self._frame != FRAME:
+            return WARN, "correcting with a calibration that does not belong (overridden)", values
         return OK, "correcting", values
 
 

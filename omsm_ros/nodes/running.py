@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -65,6 +66,17 @@ def parameter(node: Node, name: str, default: Any, description: str) -> Any:
         raise ConfigurationError(
             f"{node.get_name()}: parameter {name!r} ({description}) has the wrong type: {err}"
         ) from err
+
+
+def settings_of(text: str) -> dict[str, object]:
+    """Settings from a parameter that holds a JSON object; ConfigurationError if it does not."""
+    try:
+        settings = json.loads(text)
+    except ValueError as err:
+        raise ConfigurationError(f"settings {text!r} is not JSON: {err}") from err
+    if not isinstance(settings, dict):
+        raise ConfigurationError(f"settings {text!r} is not a JSON object")
+    return settings
 
 
 class Diagnostics:

@@ -23,6 +23,7 @@ PAPER_EQ_12 = TransferFunction.from_ascending(
 """The paper's identified G_m (Eq. 12), DC gain 1.26/1.27 as printed."""
 
 PAPER_STATIC_GAIN = PAPER_EQ_12.dc_gain
+PAPER_DYNAMICS = PAPER_EQ_12.normalised()
 
 # Slower than this, the rest of the lead-in would still be seen in the first sample.
 _LEAD_IN_TIME_CONSTANTS = 40
@@ -34,7 +35,7 @@ _CHUNK_SAMPLES = 50_000
 class Plant:
     """A critically damped servo of ``servo_bandwidth`` [Hz] and the probe's dynamics G(s)."""
 
-    dynamics: TransferFunction = PAPER_EQ_12.normalised()
+    dynamics: TransferFunction = PAPER_DYNAMICS
     servo_bandwidth: float = 200.0
 
     def __post_init__(self) -> None:

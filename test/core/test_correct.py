@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from omsm_ros.core.account import Account, StreamAccount
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.correct import CorrectionOptions, Corrector, join_points, lateral_lag
+from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, Status, SurfacePoints
 from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.trajectory import Spiral
 from omsm_ros.core.uncertainty import ErrorSources
-from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
@@ -159,6 +160,16 @@ def test_an_intensity_that_the_device_does_not_tell_is_nan(scan: Recording) -> N
     assert points.intensity.dtype == np.float32
 
 
+def test_geometry_moves_the_points(quiet_scan: Recording) -> None:
+    geometry = Geometry(centre_x=5e-6)
+    moved, _ = run([quiet_scan.axes], [quiet_scan.distance], CorrectionOptions(geometry=geometry))
+    usual, _ = run([quiet_scan.axes], [quiet_scan.distance])
+    c = quiet_scan.axes.c[usual.sample]
+    assert np.allclose(usual.x - moved.x, 5e-6 * np.cos(c), rtol=0, atol=1e-15)
+    assert np.allclose(moved.y - usual.y, 5e-6 * np.sin(c), rtol=0, atol=1e-15)
+    assert np.array_equal(moved.height, usual.height)
+
+
 # --- the same bits, live and offline --------------------------------------------------------
 
 
@@ -221,13 +232,13 @@ def test_a_probe_dropout_costs_its_points_and_nothing_else(scan: Recording) -> N
     status = scan.distance.status.copy()
     status[1000:1050] = Status.NO_TARGET
     distance = scan.distance.distance.copy()
-    distance[2000] = np.nan
+    distance[2000:2003] = np.nan, np.inf, 1e300
     whole, _ = run([scan.axes], [scan.distance])
     points, account = run([scan.axes], [replace(scan.distance, status=status, distance=distance)])
-    lost = np.r_[1000:1050, 2000]
+    lost = np.r_[1000:1050, 2000:2003]
     kept = ~np.isin(whole.sample, lost)
     assert np.array_equal(points.height, whole.height[kept])
-    assert account.axes.counted["invalid"] == account.distance.counted["invalid"] == 51
+    assert account.axes.counted["invalid"] == account.distance.counted["invalid"] == 53
 
 
 @pytest.mark.parametrize("channel", ["x", "y", "z", "b", "c"])
@@ -331,6 +342,21 @@ def test_what_waits_in_vain_is_bounded(scan: Recording) -> None:
         assert balanced(corrector.account.axes)
     unmatched = 3000 - corrector.account.axes.counted["settling"]
     assert corrector.account.axes.counted["unmatched"] == unmatched
+
+
+def test_stamps_that_disagree_about_a_trigger_are_told(scan: Recording) -> None:
+    corrector = Corrector(CALIBRATION)
+    assert corrector.stamp_skew is None
+    corrector.push_axes(scan.axes)
+    corrector.push_distance(shifted(scan.distance, 0, 0.04))  # type: ignore[arg-type]
+    assert corrector.stamp_skew == pytest.approx(-0.04)
+
+
+def test_a_refused_block_leaves_the_account_as_it_was(scan: Recording) -> None:
+    corrector = Corrector(CALIBRATION)
+    with pytest.raises(DataError, match="first_sample"):
+        corrector.push_axes(replace(scan.axes, first_sample=2**63))
+    assert corrector.account == Account()
 
 
 def test_after_finish_a_new_scan_may_begin(scan: Recording) -> None:

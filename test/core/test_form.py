@@ -224,3 +224,26 @@ def test_a_gain_on_the_travel_shows_as_its_share_of_the_sag(spiral):
     found = form.statistics(form.level(x, y, error), form.spiral_weights(x, y))
     assert found.peak_to_valley == pytest.approx(np.ptp(sag) / 127)
     assert found.peak_to_valley == pytest.approx(8.9e-6, rel=0.01)
+
+
+class TestRunningStatistics:
+    @pytest.mark.parametrize("portion", [1, 7, 1000])
+    @pytest.mark.parametrize("stand_off", [0.0, 3e-3])
+    def test_agrees_with_the_whole(self, portion, stand_off):
+        random = np.random.default_rng(5)
+        x, y = random.uniform(-0.01, 0.01, (2, 1000))
+        deviation = 50e-9 * random.standard_normal(1000) + 2e-6 * x + stand_off
+        running = form.RunningStatistics()
+        for start in range(0, 1000, portion):
+            part = slice(start, start + portion)
+            running.add(x[part], y[part], deviation[part])
+        weights = form.spiral_weights(x, y)
+        whole = form.statistics(form.level(x, y, deviation, weights=weights), weights)
+        found = running.statistics()
+        assert found.points == 1000
+        for name in ("peak_to_valley", "rms", "rms_area_weighted"):
+            assert getattr(found, name) == pytest.approx(getattr(whole, name), rel=1e-9)
+
+    def test_nothing_is_no_cloud(self):
+        with pytest.raises(DataError, match="0 points"):
+            form.RunningStatistics().statistics()

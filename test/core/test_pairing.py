@@ -175,3 +175,37 @@ def test_expected_outcome_of_the_mixed_case(swap: bool) -> None:
     expected = [(0, 0, k) for k in [*range(10, 90), *range(120, 180)]]
     expected += [(1, 1, k) for k in range(3, 90)]
     assert bench.found == expected
+
+
+def random_streams(random: np.random.Generator) -> tuple[list[Run], list[Run]]:
+    """Some sessions of 5 to 6000 samples, seen by one stream or both, with gaps."""
+    streams: tuple[list[Run], list[Run]] = ([], [])
+    start, sessions = 0.0, [0, 0]
+    for _ in range(random.integers(1, 5)):
+        start += random.choice([1.0, 5.0, 30.0])
+        length = int(random.integers(5, 60) * random.choice([1, 100]))
+        for stream in (0, 1):
+            if random.random() < 0.15:
+                continue
+            edges = np.unique(random.integers(0, length + 1, 6))
+            for a, b in itertools.pairwise(edges.tolist()):
+                if random.random() < 0.8:
+                    streams[stream].append(run(sessions[stream], a, b - a, start + a * 1e-3))
+            sessions[stream] += 1
+        start += length * 1e-3
+    return streams
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_any_sessions_pair_alike_however_cut_and_interleaved(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    whole = random_streams(random)
+    expected = Bench().push(*whole).finish()
+    for _ in range(3):
+        axes, distance = (pieces(random.integers(1, 400, 8).tolist(), runs) for runs in whole)
+        bench = Bench()
+        while axes or distance:
+            source = axes if axes and (random.random() < 0.5 or not distance) else distance
+            piece = [source.pop(0)]
+            bench.push(*((piece, []) if source is axes else ([], piece)))
+        assert bench.finish() == expected

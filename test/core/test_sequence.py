@@ -8,6 +8,7 @@ import pytest
 
 from omsm_ros.core.records import Block
 from omsm_ros.core.sequence import COUNTER_SPAN, Admission, Sequence
+from omsm_ros.errors import DataError
 
 
 def block(first: int, stamp_s: float) -> Block:
@@ -111,3 +112,8 @@ def test_after_an_end_everything_is_new(stream: Stream) -> None:
     stream(0, 0.0)
     stream.sequence.end()
     assert stream(100, 0.1) == Admission(1, 100, 0, 0)
+
+
+def test_a_count_that_no_device_reaches_is_refused(stream: Stream) -> None:
+    with pytest.raises(DataError, match="18446744073709551615"):
+        stream(2**64 - 1, 0.0)
