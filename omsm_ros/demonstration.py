@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros import bags, measurement, offline
+from omsm_ros import bags, measurement, offline, publication
 from omsm_ros.core import form
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.cloud import CLOUD_FIELDS
@@ -21,7 +21,7 @@ from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import load_calibration, open_ply
+from omsm_ros.files import load_calibration, open_ply, save_json
 from omsm_ros.report import response_figures, style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.figures import overview_figure
@@ -122,11 +122,12 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     calibration = load_calibration(plan.calibration_file)
     account = offline.correct_bag(plan.bag, calibration, plan.out / measurement.CLOUD)
     cloud = open_ply(plan.out / measurement.CLOUD)
-    view = measurement.view_of(cloud, plan.sample_period)
+    view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
     summary = measurement.summarise(plan.bag, account, cloud, calibration, PAPER_MIRROR)
+    summary["files"] |= {"report": measurement.REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
     summary["response"] = response_errors(calibration, Plant().dynamics)
@@ -140,7 +141,8 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     )
     figures |= calibration_figures(calibration, step_test_of(plan.scenario))
     (plan.out / OVERVIEW).write_bytes(overview(view, calibration))
-    measurement.publish(plan.out, TITLE, summary, calibration, figures)
+    save_json(plan.out / measurement.SUMMARY, summary)
+    publication.publish(plan.out, TITLE, summary, calibration, figures)
     return summary
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,15 +20,10 @@ from omsm_ros.core.correct import CorrectionOptions
 from omsm_ros.core.predict import predict_error
 from omsm_ros.core.surface import Surface
 from omsm_ros.errors import DataError
-from omsm_ros.files import open_ply, save_json, whole_file
-from omsm_ros.report import style
-from omsm_ros.report.cloud_view import CloudView
-from omsm_ros.report.gallery import surface_figures
-from omsm_ros.report.page import Report, render
-from omsm_ros.report.response_figures import bode
+from omsm_ros.files import open_ply, save_json
 
 # Bound the memory whatever the length of a scan.
-_MOST_DRAWN = 1_000_000
+_MOST_SORTED = 1_000_000
 _PORTION = 500_000
 _MOST_JUDGED = 2_000_000
 
@@ -56,9 +50,12 @@ def measure(
     nominal: Surface | None = None,
     options: CorrectionOptions | None = None,
     admission: Admission | None = None,
+    report: bool = True,
     progress: offline.Progress = offline.no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
+
+    report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
     """
@@ -76,34 +73,16 @@ def measure(
     summary = summarise(bag, account, cloud, calibration, nominal)
     summary["admission"] = admitted
     summary["warnings"] += [f"overridden: {reason}" for reason in reasons]
-    view = view_of(cloud, period)
-    figures = surface_figures(view, nominal) if view is not None else {}
-    figures["bode"] = style.png(bode(calibration, None, period))
-    publish(out, f"Surface of {bag.name}", summary, calibration, figures)
+    if report:
+        summary["files"]["report"] = REPORT
+    save_json(out / SUMMARY, summary)
+    if report:
+        # Here, because drawing takes longer to load than a scan to correct.
+        from omsm_ros.publication import figures_of, publish
+
+        figures = figures_of(cloud, calibration, nominal, period)
+        publish(out, f"Surface of {bag.name}", summary, calibration, figures)
     return summary
-
-
-def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
-    """Columns of a cloud for the figures; None if it has no points.
-
-    A cloud of more than a million points is thinned evenly: no picture has so many pixels,
-    and all numbers come from all points. Without the dynamic correction its height would be
-    ``raw_height``.
-    """
-    if not len(cloud):
-        return None
-    cloud = cloud[:: -(-len(cloud) // _MOST_DRAWN)]
-    sample = cloud["sample"].astype(np.int64)
-    error = cloud["dynamic_error"].astype(np.float64)
-    return CloudView(
-        time=(sample - sample[0]) * sample_period,
-        x=cloud["x"].astype(np.float64),
-        y=cloud["y"].astype(np.float64),
-        height=cloud["height"].astype(np.float64),
-        raw_height=cloud["height"] + error,
-        dynamic_error=error,
-        uncertainty=cloud["uncertainty"].astype(np.float64),
-    )
 
 
 def summarise(
@@ -125,7 +104,7 @@ def summarise(
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
         },
-        "files": {"cloud": CLOUD, "summary": SUMMARY, "report": REPORT},
+        "files": {"cloud": CLOUD, "summary": SUMMARY},
     }
     summary["warnings"] = _warnings(bag, calibration, len(cloud))
     return summary | _figures_of_merit(cloud, nominal)
@@ -172,19 +151,4 @@ def _figures_of_merit(cloud: NDArray[np.void], nominal: Surface | None) -> dict[
 
 
 def _median(values: NDArray[np.float32]) -> float:
-    return float(np.median(values[:: -(-len(values) // _MOST_DRAWN)]))
-
-
-def publish(
-    out: Path,
-    title: str,
-    summary: Mapping[str, Any],
-    calibration: Calibration,
-    figures: Mapping[str, bytes],
-) -> None:
-    """Write summary.json and report.html."""
-    save_json(out / SUMMARY, summary)
-    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    page = render(Report(title, date, summary, calibration=calibration, figures=figures))
-    with whole_file(out / REPORT, "w") as stream:
-        stream.write(page)
+    return float(np.median(values[:: -(-len(values) // _MOST_SORTED)]))

@@ -14,6 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"nodes", "cli"},
     {"demonstration"},
+    {"publication"},
     {"measurement"},
     {"offline"},
     {"bags", "files", "conversions", "devices", "emulators", "report"},

@@ -55,6 +55,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
     sub.add_argument("--lateral-lag", type=float, help="of the probe against X and C [s]")
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
+    sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
     sub.add_argument(
         "--override", action="store_true", help="use a calibration that does not belong; recorded"
@@ -78,6 +79,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             nominal=nominal,
             options=options,
             admission=Admission(args.settings, args.override),
+            report=not args.no_report,
             progress=progress,
         )
 
