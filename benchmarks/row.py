@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TypedDict
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(TypedDict):
     """A measured figure and the bar it has to clear.
 
     name: what was measured;  value, unit: the figure
-    peer: what it is measured against;  bar: the condition in words;  holds: whether it is met
+    peer: the figure of what it is measured against, or its name, or None
+    bar: the condition in words;  holds: whether it is met, None where nothing could be compared
     """
 
     name: str
     value: float
     unit: str
-    peer: str
+    peer: float | str | None
     bar: str
-    holds: bool
+    holds: bool | None
 
 
-def at_most(name: str, value: float, unit: str, limit: float, peer: str = "") -> Row:
+def at_most(
+    name: str, value: float, unit: str, limit: float, peer: float | str | None = None
+) -> Row:
     """A figure that must not exceed ``limit``."""
-    return Row(name, float(value), unit, peer, f"<= {limit:g}", bool(value <= limit))
+    value = float(value)
+    return Row(
+        name=name, value=value, unit=unit, peer=peer, bar=f"<= {limit:g}", holds=value <= limit
+    )
 
 
-def at_least(name: str, value: float, unit: str, limit: float, peer: str = "") -> Row:
+def at_least(
+    name: str, value: float, unit: str, limit: float, peer: float | str | None = None
+) -> Row:
     """A figure that must reach ``limit``."""
-    return Row(name, float(value), unit, peer, f">= {limit:g}", bool(value >= limit))
+    value = float(value)
+    return Row(
+        name=name, value=value, unit=unit, peer=peer, bar=f">= {limit:g}", holds=value >= limit
+    )
 
 
-def between(name: str, value: float, unit: str, low: float, high: float, peer: str = "") -> Row:
+def between(
+    name: str, value: float, unit: str, low: float, high: float, peer: float | str | None = None
+) -> Row:
     """A figure that must lie within ``low`` and ``high``."""
-    return Row(name, float(value), unit, peer, f"{low:g} to {high:g}", bool(low <= value <= high))
+    value = float(value)
+    bar, holds = f"{low:g} to {high:g}", low <= value <= high
+    return Row(name=name, value=value, unit=unit, peer=peer, bar=bar, holds=holds)

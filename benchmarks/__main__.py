@@ -1,0 +1,56 @@
+"""All benchmarks, one table, ``out/bench.json``: ``python -m benchmarks [part …]``.
+
+Ends with exit status 1 if a bar is not cleared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.row import Row
+
+PARTS = ("identification", "correction", "offline", "live", "real_data")
+
+
+def show(row: Row) -> None:
+    """Print one line of the table."""
+    mark = {True: "ok", False: "FAILS", None: "-"}[row["holds"]]
+    peer = row["peer"]
+    against = f"{peer:.4g}" if isinstance(peer, float) else peer or ""
+    print(
+        f"{mark:<6}{row['name']:<62}{row['value']:>12.4g} {row['unit']:<9}"
+        f"{row['bar']:<16}{against}",
+        flush=True,
+    )
+
+
+def main() -> int:
+    """Run the parts asked for, all by default."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("parts", nargs="*", default=PARTS, metavar="part", help=", ".join(PARTS))
+    parser.add_argument("--out", type=Path, default=Path("out/bench.json"))
+    args = parser.parse_args()
+    unknown = sorted(set(args.parts) - set(PARTS))
+    if unknown:
+        parser.error(f"no part {unknown}, expected {', '.join(PARTS)}")
+    found: list[Row] = []
+    for part in args.parts:
+        begin = time.monotonic()
+        for row in importlib.import_module(f"benchmarks.{part}").rows():
+            found.append(row)
+            show(row)
+        print(f"      {part}: {time.monotonic() - begin:.0f} s", flush=True)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    failed = [row["name"] for row in found if row["holds"] is False]
+    print(f"{len(found)} figures in {args.out}, {len(failed)} bars not cleared")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
