@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,16 @@ from omsm_ros.core.discretise import discretise
 from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.motion_record import MotionRecord, assemble
 from omsm_ros.core.predict import Prediction, predict_error
-from omsm_ros.core.records import AxisBlock, Block, DistanceBlock, FloatArray, SurfacePoints
+from omsm_ros.core.records import (
+    AxisBlock,
+    Block,
+    DistanceBlock,
+    FloatArray,
+    SurfacePoints,
+    follows,
+    join_axes,
+    join_distance,
+)
 from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.reversal import SidewaysLag, sideways_lag
 from omsm_ros.core.validate import PathCheck, check_path
@@ -27,6 +37,7 @@ from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.files import PlyWriter
 
 _START_SAMPLES = 12
+_GATHERED_BLOCKS = 32
 
 Progress = Callable[[int, int], None]
 """Called with messages done and messages in all."""
@@ -108,10 +119,10 @@ def correct_bag(
         PlyWriter(cloud, f"omsm_ros, metres, calibration {calibration.id} {comment}") as ply,
     ):
         total = bag.count(topics)
-        for done, (_, record) in enumerate(bag.records(*topics), start=1):
+        for done, record in _gathered(bag.records(*topics)):
             if isinstance(record, AxisBlock):
                 corrector.push_axes(record)
-            else:
+            elif isinstance(record, DistanceBlock):
                 corrector.push_distance(record)
             if (points := corrector.take()) is not None:
                 ply.write(points)
@@ -119,6 +130,26 @@ def correct_bag(
         if (rest := corrector.finish()) is not None:
             ply.write(rest)
     return dict(corrector.account.as_dict())
+
+
+def _gathered(records: Iterable[bags.Item]) -> Iterator[tuple[int, Block]]:
+    """Blocks of a bag joined into long ones, and how many messages have been read.
+
+    The result of a correction does not depend on how its samples were cut; its speed does.
+    """
+    waiting: dict[type[Block], list[Any]] = {AxisBlock: [], DistanceBlock: []}
+    done = 0
+    for done, (_, record) in enumerate(records, start=1):
+        blocks = waiting[type(record)]
+        if blocks and not (len(blocks) < _GATHERED_BLOCKS and follows(record, blocks[-1])):
+            yield done, _join(blocks)
+            blocks.clear()
+        blocks.append(record)
+    yield from ((done, _join(blocks)) for blocks in waiting.values() if blocks)
+
+
+def _join(blocks: list[Any]) -> Block:
+    return join_axes(blocks) if isinstance(blocks[0], AxisBlock) else join_distance(blocks)
 
 
 # ------------------------------------------------------------------- scans as a whole
