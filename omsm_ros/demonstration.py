@@ -21,7 +21,7 @@ from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import load_calibration, open_ply, save_json
+from omsm_ros.files import CLOUD, REPORT, SUMMARY, load_calibration, open_ply, save_json
 from omsm_ros.report import response_figures, style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.figures import overview_figure
@@ -114,20 +114,20 @@ class Demonstration:
 
 
 OVERVIEW = "overview.png"
-_RESULTS = (measurement.CLOUD, measurement.SUMMARY, measurement.REPORT, OVERVIEW)
+_RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
 
 
 def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
-    account = offline.correct_bag(plan.bag, calibration, plan.out / measurement.CLOUD)
-    cloud = open_ply(plan.out / measurement.CLOUD)
+    account = offline.correct_bag(plan.bag, calibration, plan.out / CLOUD)
+    cloud = open_ply(plan.out / CLOUD)
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
     summary = measurement.summarise(plan.bag, account, cloud, calibration, PAPER_MIRROR)
-    summary["files"] |= {"report": measurement.REPORT, "overview": OVERVIEW}
+    summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
     summary["response"] = response_errors(calibration, Plant().dynamics)
@@ -141,7 +141,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     )
     figures |= calibration_figures(calibration, step_test_of(plan.scenario))
     (plan.out / OVERVIEW).write_bytes(overview(view, calibration))
-    save_json(plan.out / measurement.SUMMARY, summary)
+    save_json(plan.out / SUMMARY, summary)
     publication.publish(plan.out, TITLE, summary, calibration, figures)
     return summary
 

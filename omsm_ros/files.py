@@ -23,6 +23,9 @@ from omsm_ros.core.records import SurfacePoints
 from omsm_ros.core.surface import Surface, surface_from_description
 from omsm_ros.errors import CalibrationError, ConfigurationError, FileError, SurfaceError
 
+CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
+"""The files of a measurement."""
+
 MAX_CALIBRATION_BYTES = 4_000_000
 MAX_YAML_BYTES = 100_000
 

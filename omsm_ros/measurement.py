@@ -20,14 +20,12 @@ from omsm_ros.core.correct import CorrectionOptions
 from omsm_ros.core.predict import predict_error
 from omsm_ros.core.surface import Surface
 from omsm_ros.errors import DataError
-from omsm_ros.files import open_ply, save_json
+from omsm_ros.files import CLOUD, REPORT, SUMMARY, open_ply, save_json
 
 # Bound the memory whatever the length of a scan.
 _MOST_SORTED = 1_000_000
 _PORTION = 500_000
 _MOST_JUDGED = 2_000_000
-
-CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 
 
 @dataclass(frozen=True)

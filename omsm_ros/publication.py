@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.surface import Surface
-from omsm_ros.files import save_text
-from omsm_ros.measurement import REPORT
+from omsm_ros.files import REPORT, save_text
 from omsm_ros.report import style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.gallery import surface_figures

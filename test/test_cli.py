@@ -127,3 +127,12 @@ def test_commands_work_without_ros(folder):
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, timeout=50)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["topics"]
+
+
+def test_every_word_is_where_main_looks_for_it():
+    import importlib
+
+    from omsm_ros.cli.main import WORDS
+
+    for module, words in WORDS.items():
+        assert tuple(c.name for c in importlib.import_module(module).COMMANDS) == words

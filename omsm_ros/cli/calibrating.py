@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros import offline
+from omsm_ros import studies
 from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
 from omsm_ros.core.calibration import Calibration, verdict_of
 from omsm_ros.core.drift import compare
@@ -30,14 +30,26 @@ def _declare_identify(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
+    sub.add_argument(
+        "--report", type=Path, metavar="DIR", help="write the certificate: HTML, Markdown, plots"
+    )
 
 
 def _identify(args: argparse.Namespace) -> Facts:
     with progress_bar("reading", args.json) as progress:
-        motion = offline.motion_of_bag(args.bag, duration=args.duration, progress=progress)
+        motion = studies.motion_of_bag(args.bag, duration=args.duration, progress=progress)
     calibration = identify(motion, order=args.order, input=args.input, settings=args.settings)
     save_calibration(args.out, calibration)
-    return calibration_facts(calibration) | {"calibration": str(args.out)}
+    facts = calibration_facts(calibration) | {"calibration": str(args.out)}
+    if args.report is not None:
+        # Drawing takes a second to import; most commands do without.
+        from omsm_ros.certification import write_certificate
+
+        page = write_certificate(
+            args.report, calibration, motion, input=args.input, source=args.bag.name
+        )
+        facts["report"] = str(page)
+    return facts
 
 
 def calibration_facts(calibration: Calibration) -> Facts:
@@ -65,7 +77,10 @@ def _show_identify(facts: Facts) -> None:
     ]
     for kind in ("reasons", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts[kind]]
-    table([*rows, ("written to", facts["calibration"])])
+    rows.append(("written to", facts["calibration"]))
+    if "report" in facts:
+        rows.append(("certificate", facts["report"]))
+    table(rows)
 
 
 # -------------------------------------------------------------------------------- verify
@@ -79,7 +94,7 @@ def _declare_verify(sub: argparse.ArgumentParser) -> None:
 def _verify(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("reading", args.json) as progress:
-        check = offline.path_check_of(args.bag, calibration, progress)
+        check = studies.path_check_of(args.bag, calibration, progress)
     edges = np.arange(0.0, math.floor(check.frequency.max()) + 1.0)
     bands = [
         {
@@ -171,7 +186,7 @@ def _show_plan(facts: Facts) -> None:
     )
 
 
-CALIBRATING = (
+COMMANDS = (
     Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
     Command(
         "identify", "identify G_m from a recording", _declare_identify, _identify, _show_identify

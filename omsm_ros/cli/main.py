@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import subprocess
 import sys
@@ -10,21 +11,32 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from omsm_ros import __version__
-from omsm_ros.cli.calibrating import CALIBRATING
-from omsm_ros.cli.command import positive
-from omsm_ros.cli.measuring import MEASURING
+from omsm_ros.cli.command import Command, positive
 from omsm_ros.errors import OmsmError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
+# A correction takes a quarter of a second; loading what identifies would take twice that.
+WORDS = {
+    "omsm_ros.cli.measuring": ("inspect", "predict", "correct"),
+    "omsm_ros.cli.aligning": ("reversal", "align"),
+    "omsm_ros.cli.calibrating": ("plan", "identify", "verify", "compare"),
+}
 
-def _parser() -> argparse.ArgumentParser:
+
+def _commands(word: str) -> list[Command]:
+    """The commands of the module that knows ``word``; all of them if none does."""
+    wanted = [module for module, words in WORDS.items() if word in words] or list(WORDS)
+    return [c for module in wanted for c in importlib.import_module(module).COMMANDS]
+
+
+def _parser(word: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="omsm", description="Identify, correct and judge recorded measurements."
     )
     parser.add_argument("--version", action="version", version=__version__)
     words = parser.add_subparsers(required=True, metavar="command", dest="command")
-    for command in (*CALIBRATING, *MEASURING):
+    for command in _commands(word):
         sub = words.add_parser(command.name, help=command.help, description=command.help)
         sub.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
         sub.set_defaults(run=command)
@@ -46,7 +58,8 @@ def _demo(args: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    args = _parser().parse_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    args = _parser(given[0] if given else "").parse_args(given)
     try:
         if args.command == "demo":
             return _demo(args)

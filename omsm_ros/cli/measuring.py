@@ -1,4 +1,4 @@
-"""Commands around a scan: inspect, predict, correct, reversal, align."""
+"""Commands around a scan: inspect, predict, correct."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from omsm_ros.cli.command import Command, Facts, json_object, positive, progress
 from omsm_ros.core.correct import CorrectionOptions
 from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.predict import DEFAULT_BUDGET_M, predict_error
-from omsm_ros.files import load_calibration, load_geometry, load_surface, save_geometry
+from omsm_ros.files import load_calibration, load_geometry, load_surface
 from omsm_ros.measurement import Admission, measure
-from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
-_CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
+CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
 
-def _geometry(path: Path | None) -> Geometry:
+def geometry_of(path: Path | None) -> Geometry:
     return load_geometry(path) if path else Geometry()
 
 
@@ -49,7 +49,7 @@ def _show_inspect(facts: Facts) -> None:
 
 def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path)
-    sub.add_argument("--calibration", **_CALIBRATION)
+    sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
@@ -69,7 +69,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         polarity=args.polarity,
         accept_other_rate=args.override,
         lateral_lag=args.lateral_lag,
-        geometry=_geometry(args.geometry),
+        geometry=geometry_of(args.geometry),
     )
     with progress_bar("correcting", args.json) as progress:
         return measure(
@@ -99,7 +99,7 @@ def _show_correct(summary: Facts) -> None:
 
 def _declare_predict(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path, help="a recorded motion")
-    sub.add_argument("--calibration", **_CALIBRATION)
+    sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument(
         "--budget", type=positive, default=DEFAULT_BUDGET_M, help="allowed residual, k = 2 [m]"
     )
@@ -126,84 +126,7 @@ def _show_predict(facts: Facts) -> None:
     )  # fmt: skip
 
 
-# ------------------------------------------------------------------------------ reversal
-
-
-def _declare_reversal(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
-    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
-    sub.add_argument("--calibration", **_CALIBRATION)
-
-
-def _reversal(args: argparse.Namespace) -> Facts:
-    calibration = load_calibration(args.calibration)
-    with progress_bar("correcting", args.json) as progress:
-        bags = (args.clockwise, args.counterclockwise)
-        return asdict(offline.sideways_lag_of(bags, calibration, progress))
-
-
-_MEANINGS = {
-    True: "the probe is late: X and C must be delayed too (setting lag_is_latency)",
-    False: "the lag is mechanical, in Z only",
-    None: "neither none nor all of the lag of Z; give it with --lateral-lag",
-}
-
-
-def _show_reversal(facts: Facts) -> None:
-    table(
-        [
-            ("sideways lag", f"{facts['lag'] / MICROSECOND_S:.2f} µs "
-                             f"± {facts['uncertainty'] / MICROSECOND_S:.2f} µs (k = 1)"),
-            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
-            ("meaning", _MEANINGS[facts["latency"]]),
-            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
-        ]
-    )  # fmt: skip
-
-
-# --------------------------------------------------------------------------------- align
-
-
-def _declare_align(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path, help="a scan of a reference sphere")
-    sub.add_argument("--calibration", **_CALIBRATION)
-    sub.add_argument("--radius", type=float, required=True, help="[m], negative if convex")
-    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="what is known")
-    sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
-
-
-def _align(args: argparse.Namespace) -> Facts:
-    calibration = load_calibration(args.calibration)
-    known = _geometry(args.geometry)
-    with progress_bar("correcting", args.json) as progress:
-        found = offline.alignment_of(args.bag, calibration, args.radius, known, progress)
-    save_geometry(args.out, found.geometry)
-    names = ("centre_x", "centre_y", "beam_x", "beam_y")
-    # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.
-    spread = found.uncertainty if found.beam_found else (*found.uncertainty[:2], None, None)
-    return {
-        "geometry": asdict(found.geometry),
-        "uncertainty": dict(zip(names, spread, strict=True)),
-        "residual": found.residual,
-        "beam_found": found.beam_found,
-        "file": str(args.out),
-    }
-
-
-def _show_align(facts: Facts) -> None:
-    rows = []
-    for name, spread in facts["uncertainty"].items():
-        value, length = facts["geometry"][name], name.startswith("centre")
-        unit, text = (MICROMETRE_M, "µm") if length else (1e-3, "mrad")
-        stated = (
-            "not to be seen in this scan" if spread is None else f"± {spread / unit:.4f} {text}"
-        )
-        rows.append((name, f"{value / unit:.4f} {text} {stated}"))
-    rows.append(("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"))
-    table([*rows, ("written to", facts["file"])])
-
-
-MEASURING = (
+COMMANDS = (
     Command("inspect", "show what a bag holds", _declare_inspect, _inspect, _show_inspect),
     Command(
         "predict",
@@ -213,18 +136,4 @@ MEASURING = (
         _show_predict,
     ),
     Command("correct", "correct a recorded scan", _declare_correct, _correct, _show_correct),
-    Command(
-        "reversal",
-        "is the lag latency? From two scans with opposite spindle directions",
-        _declare_reversal,
-        _reversal,
-        _show_reversal,
-    ),
-    Command(
-        "align",
-        "spindle centre and beam direction from a scan of a reference sphere",
-        _declare_align,
-        _align,
-        _show_align,
-    ),
 )

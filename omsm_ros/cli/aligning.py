@@ -1,0 +1,107 @@
+"""Commands that find out how the probe sits: reversal, align."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from omsm_ros import studies
+from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.measuring import CALIBRATION, geometry_of
+from omsm_ros.files import load_calibration
+from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
+
+# ------------------------------------------------------------------------------ reversal
+
+
+def _declare_reversal(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
+    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
+    sub.add_argument("--calibration", **CALIBRATION)
+
+
+def _reversal(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("correcting", args.json) as progress:
+        bags = (args.clockwise, args.counterclockwise)
+        return asdict(studies.sideways_lag_of(bags, calibration, progress))
+
+
+_MEANINGS = {
+    True: "the probe is late: X and C must be delayed too (setting lag_is_latency)",
+    False: "the lag is mechanical, in Z only",
+    None: "neither none nor all of the lag of Z; give it with --lateral-lag",
+}
+
+
+def _show_reversal(facts: Facts) -> None:
+    table(
+        [
+            ("sideways lag", f"{facts['lag'] / MICROSECOND_S:.2f} µs "
+                             f"± {facts['uncertainty'] / MICROSECOND_S:.2f} µs (k = 1)"),
+            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
+            ("meaning", _MEANINGS[facts["latency"]]),
+            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
+        ]
+    )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------- align
+
+
+def _declare_align(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, help="a scan of a reference sphere")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument("--radius", type=float, required=True, help="[m], negative if convex")
+    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="what is known")
+    sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
+
+
+def _align(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    known = geometry_of(args.geometry)
+    with progress_bar("correcting", args.json) as progress:
+        found = studies.alignment_of(args.bag, calibration, args.radius, known, progress)
+    save_geometry(args.out, found.geometry)
+    names = ("centre_x", "centre_y", "beam_x", "beam_y")
+    # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.
+    spread = found.uncertainty if found.beam_found else (*found.uncertainty[:2], None, None)
+    return {
+        "geometry": asdict(found.geometry),
+        "uncertainty": dict(zip(names, spread, strict=True)),
+        "residual": found.residual,
+        "beam_found": found.beam_found,
+        "file": str(args.out),
+    }
+
+
+def _show_align(facts: Facts) -> None:
+    rows = []
+    for name, spread in facts["uncertainty"].items():
+        value, length = facts["geometry"][name], name.startswith("centre")
+        unit, text = (MICROMETRE_M, "µm") if length else (1e-3, "mrad")
+        stated = (
+            "not to be seen in this scan" if spread is None else f"± {spread / unit:.4f} {text}"
+        )
+        rows.append((name, f"{value / unit:.4f} {text} {stated}"))
+    rows.append(("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"))
+    table([*rows, ("written to", facts["file"])])
+
+
+COMMANDS = (
+    Command(
+        "reversal",
+        "is the lag latency? From two scans with opposite spindle directions",
+        _declare_reversal,
+        _reversal,
+        _show_reversal,
+    ),
+    Command(
+        "align",
+        "spindle centre and beam direction from a scan of a reference sphere",
+        _declare_align,
+        _align,
+        _show_align,
+    ),
+)
