@@ -14,8 +14,8 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"nodes", "cli"},
     {"demonstration"},
-    {"publication"},
     {"measurement", "certification"},
+    {"publication"},
     {"studies"},
     {"offline"},
     {"bags", "files", "conversions", "devices", "emulators", "report"},

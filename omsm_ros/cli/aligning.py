@@ -9,7 +9,7 @@ from pathlib import Path
 from omsm_ros import studies
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
-from omsm_ros.files import load_calibration
+from omsm_ros.files import load_calibration, save_geometry
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
 
 # ------------------------------------------------------------------------------ reversal

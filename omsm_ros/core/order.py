@@ -19,11 +19,15 @@ import numpy as np
 from omsm_ros.core.output_error import Fit, Problem, fit
 from omsm_ros.core.records import BoolArray
 from omsm_ros.core.structure import Structure
+from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.errors import IdentificationError
 
 MAX_POLES = 8
 _LEAST_PARAMETERS = 3
 # Held-out rms, relative: far above its scatter over a few thousand samples.
 _CLEARLY_WORSE = 1.05
+# Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
+_CANCELLING = 0.005
 
 
 def structures(poles: int) -> list[Structure]:
@@ -60,7 +64,10 @@ def explore(
     """Fit structure after structure; stop when two more poles in a row gain nothing.
 
     at_least: number of poles to go to in any case;  forced: only this many, if not 0
+    Raises IdentificationError for a forced order that is no number of poles to try.
     """
+    if not 0 <= forced <= MAX_POLES:
+        raise IdentificationError(f"order {forced!r}, expected 0 (choose) to {MAX_POLES}")
     found: list[Candidate] = []
     fruitless = 0
     for poles in range(forced + 1) if forced else range(MAX_POLES + 1):
@@ -101,7 +108,8 @@ def choose(
     """The best by BIC, enriched: the best of those that contain it with one parameter more.
 
     With fewer than three parameters, lag and roll-off could not both bend over the band.
-    The enriched one is vetoed where it is clearly worse on edges it has not seen.
+    One whose zero cancels a pole is no richer. The enriched one is vetoed where it is
+    clearly worse on edges it has not seen.
 
     held_out: rms [m] of a structure, fitted without the held-out edges, on them
     """
@@ -110,7 +118,9 @@ def choose(
     richer = [
         c
         for c in candidates
-        if c.fit.structure.contains(smallest.fit.structure) and c.fit.structure.size >= wanted
+        if c.fit.structure.contains(smallest.fit.structure)
+        and c.fit.structure.size >= wanted
+        and not cancels(c.fit.dynamics)
     ]
     enriched = min(
         richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest
@@ -120,6 +130,13 @@ def choose(
     if chosen.held_out > _CLEARLY_WORSE * scored[smallest].held_out:
         chosen = scored[smallest]
     return chosen, [scored.get(c, c) for c in candidates]
+
+
+def cancels(dynamics: TransferFunction) -> bool:
+    """True if a zero all but cancels a pole, which then means nothing and has no covariance."""
+    poles, zeros = dynamics.poles(), dynamics.zeros()
+    apart = np.abs(poles[:, np.newaxis] - zeros[np.newaxis])
+    return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
 
 
 def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
