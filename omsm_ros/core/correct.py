@@ -68,7 +68,11 @@ class CorrectionOptions:
 
 
 class Corrector:
-    """Turns axis and distance blocks into surface points, in the order of their triggers."""
+    """Turns axis and distance blocks into surface points, in the order of their triggers.
+
+    Push the two streams about as they came: what waits longer than ``max_pending`` for its
+    partner is given up, so that memory stays bounded. Each may also come as one block.
+    """
 
     def __init__(
         self, calibration: Calibration, options: CorrectionOptions = CorrectionOptions()

@@ -11,21 +11,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import factorial
 
 import numpy as np
 from numpy.polynomial import polynomial
-from scipy import linalg, signal
+from scipy import signal
 
+from omsm_ros.core.held_input import held_zeros
 from omsm_ros.core.records import FloatArray
 from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, DataError
 
 DEFAULT_ORDER = 3
 # Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.
 _MATCHED_RAD = 0.02
-# A zero this far out is a constant factor to 1e-9 of the gain, or infinity after rounding.
-_FAR_ZERO = 1e9
+_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,26 +63,45 @@ class DigitalFilter:
 
 
 def discretise(
-    dynamics: TransferFunction, sample_period: float, order: int = DEFAULT_ORDER
+    dynamics: TransferFunction,
+    sample_period: float,
+    order: int = DEFAULT_ORDER,
+    poles: ComplexArray | None = None,
 ) -> DigitalFilter:
     """Integrate ``dynamics`` over the polynomial of ``order`` through the newest samples.
 
-    Raises ConfigurationError for an order outside 1 to 7 or a sample_period that is not positive.
+    poles: of ``dynamics`` [rad/s], where they are known better than from its coefficients
+
+    Raises ConfigurationError for an order outside 1 to 7 or a sample_period that is not
+    positive, DataError for dynamics that samples this far apart cannot represent.
     """
     if not 1 <= order <= 7:
         raise ConfigurationError(f"interpolation order {order!r}, expected 1 to 7")
     if not (np.isfinite(sample_period) and sample_period > 0):
         raise ConfigurationError(f"sample_period {sample_period!r} s, expected a positive number")
-    poles = np.exp(dynamics.poles() * sample_period)
-    zeros = _sampled_zeros(dynamics, sample_period, order)
-    if len(poles):
-        poles = np.append(poles, np.zeros(order))
+    continuous = (dynamics.poles() if poles is None else poles) * sample_period
+    at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
+    zeros = held_zeros(dynamics.zeros() * sample_period, continuous, order, at_rest)
+    discrete = np.append(np.exp(continuous), np.zeros(order if len(continuous) else 0))
     late, delay_zeros = _lagrange_delay(dynamics.delay / sample_period, order)
-    late += len(poles) - len(zeros)
+    late += len(discrete) - len(zeros)
     zeros = np.concatenate([zeros, delay_zeros])
-    poles = np.append(poles, np.zeros(len(delay_zeros)))
-    gain = _gain(dynamics, sample_period, zeros, poles, late)
-    return DigitalFilter(_sections(zeros, poles, gain, late), sample_period)
+    discrete = np.append(discrete, np.zeros(len(delay_zeros)))
+    gain = _gain(dynamics, sample_period, zeros, discrete, late)
+    digital = DigitalFilter(_sections(zeros, discrete, gain, late), sample_period)
+    return _checked(digital, dynamics)
+
+
+def _checked(digital: DigitalFilter, dynamics: TransferFunction) -> DigitalFilter:
+    """Slow motion shows a resonance that folds to it, and roots that rounding has moved."""
+    slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * digital.sample_period)
+    if not np.allclose(digital.response(slow), dynamics.response(slow), rtol=_TOLERANCE, atol=0.0):
+        raise DataError(
+            f"sampled every {digital.sample_period!r} s, a transfer function with poles "
+            f"{dynamics.poles()!r} rad/s would be off by more than {_TOLERANCE:.0%} even for slow "
+            "motion; sample faster or identify a lower order"
+        )
+    return digital
 
 
 def _gain(
@@ -109,77 +127,14 @@ def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) 
     return np.vstack([signal.zpk2sos(zeros, poles, gain), *np.reshape(delays, (-1, 1, 6))])
 
 
-def bilinear(dynamics: TransferFunction, sample_period: float) -> DigitalFilter:
-    """The bilinear transform of G without its delay."""
+def bilinear(
+    dynamics: TransferFunction, sample_period: float, poles: ComplexArray | None = None
+) -> DigitalFilter:
+    """The bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
-    zpk = signal.bilinear_zpk(dynamics.zeros(), dynamics.poles(), leading, 1 / sample_period)
+    roots = dynamics.poles() if poles is None else poles
+    zpk = signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
     return DigitalFilter(np.asarray(signal.zpk2sos(*zpk)), sample_period)
-
-
-def _sampled_zeros(dynamics: TransferFunction, sample_period: float, order: int) -> ComplexArray:
-    """Zeros of the sampled system, from the Rosenbrock pencil of its state space.
-
-    With the time in sample periods and states (x[k-1], u[k-1] … u[k-order]):
-    ``x[k] = exp(a) x[k-1] + Σ_j w_j u[k-j]``, ``y[k] = c x[k] + d u[k]``.
-    """
-    a, b, c, d = _state_space(dynamics, 1 / sample_period)
-    if not len(a):
-        return np.empty(0, np.complex128)
-    step, weights = _held_integrals(a, b, order)
-    n = len(a)
-    shift = np.eye(order, k=-1)
-    system = np.block([[step, weights[:, 1:]], [np.zeros((order, n)), shift]])
-    entry = np.concatenate([weights[:, 0], np.eye(order)[0]])
-    exit_row = np.concatenate([c @ step, c @ weights[:, 1:]])
-    direct = float(c @ weights[:, 0] + d)
-    pencil = np.block([[system, entry[:, np.newaxis]], [exit_row, np.array([direct])]])
-    mass = linalg.block_diag(np.eye(n + order), 0.0)
-    zeros = linalg.eigvals(pencil, mass)
-    zeros = zeros[np.isfinite(zeros) & (abs(zeros) < _FAR_ZERO)]
-    # What G takes the derivative of, interpolation keeps: those zeros are at 1 exactly, but
-    # eigenvalues that coincide are computed to a few digits only.
-    at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
-    zeros[np.argsort(abs(zeros - 1))[:at_rest]] = 1.0
-    return np.asarray(zeros, np.complex128)
-
-
-def _state_space(
-    dynamics: TransferFunction, rate: float
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Controllable canonical form with the time in units of 1/rate: a (n, n), b (n,), c (n,), d."""
-    denominator = np.trim_zeros(dynamics.denominator, "b")
-    order = len(denominator) - 1
-    powers = rate ** np.arange(order + 1, dtype=np.float64)
-    leading = denominator[-1] * powers[-1]
-    monic = denominator * powers / leading
-    numerator = np.zeros(order + 1)
-    used = np.trim_zeros(dynamics.numerator, "b")
-    numerator[: len(used)] = used * powers[: len(used)] / leading
-    a = np.eye(order, k=1)
-    if order:
-        a[-1] = -monic[:-1]
-    direct = float(numerator[-1])
-    return (
-        a,
-        np.eye(order)[:, -1] if order else np.empty(0),
-        numerator[:-1] - direct * monic[:-1],
-        direct,
-    )
-
-
-def _held_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1] … in the step from k-1 to k."""
-    n = len(a)
-    # Driving states by a chain of integrators makes one exponential hold ∫ e^{a(1-v)} b v^j/j! dv.
-    chain = np.zeros((n + order + 1, n + order + 1))
-    chain[:n, :n] = a
-    chain[:n, n] = b
-    chain[n:, n:] = np.eye(order + 1, k=1)
-    exponential = linalg.expm(chain)
-    monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
-    nodes = 1.0 - np.arange(order + 1)
-    coefficients = np.linalg.inv(np.vander(nodes, increasing=True))
-    return exponential[:n, :n], np.asarray(monomials @ coefficients)
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:

@@ -1,187 +1,144 @@
-"""Identify from an input that is held between samples, such as a drive's own command.
+"""Where are the zeros of a continuous system whose input is a polynomial between samples?
 
-A linear system behind a zero-order hold is exactly rational in z, hence also in
-``w = (2/T)(z - 1)/(z + 1)``, with as many poles. So the same fit serves with w for s, and
-the initial state is exact too: it is a polynomial over the same denominator.
-Measured motion is not held; for that, :mod:`omsm_ros.core.identify` is the way.
+The input in the step from sample k-1 to k is the polynomial of ``order`` m through the samples
+k-m … k. The step is then integrated exactly:
+
+``x[k] = exp(a) x[k-1] + Σ_j w_j u[k-j]``, ``y[k] = c x[k] + d u[k]``, j = 0 … m.
+
+The zeros are those of the Rosenbrock pencil of this system. The state space is a series of
+sections of first and second order, each scaled by its own frequency: in companion form the
+products of poles that lie decades apart would drown the digits of the slow ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from math import factorial
+from typing import NamedTuple
 
 import numpy as np
-from scipy import fft, signal
+from numpy.polynomial import polynomial
+from scipy import linalg
 
-from omsm_ros.core.confidence import autoregression
-from omsm_ros.core.hankel import HankelVote
-from omsm_ros.core.output_error import Fit, Problem, fit
-from omsm_ros.core.records import BoolArray, FloatArray
-from omsm_ros.core.starts import StartingPoints
-from omsm_ros.core.structure import Structure
+from omsm_ros.core.records import FloatArray
 from omsm_ros.core.transfer_function import ComplexArray
-from omsm_ros.errors import IdentificationError
 
-_GREATEST_ORDER = 8
-_FITTED_PART = 2 / 3
-# Errors of a free run within this factor are alike.
-_CLOSE = 1.15
-_NO_VOTE = HankelVote(np.empty(0), 0, np.empty(0, np.complex128))
+# A zero this far out is a constant factor to 1e-9 of the gain, or infinity after rounding.
+_FAR_ZERO = 1e9
 
 
-class HeldProblem(Problem):
-    """A problem whose motion is held between samples; s is then scaled w."""
+class _StateSpace(NamedTuple):
+    """x' = a x + b u, y = c x + d u: a (n, n), b (n,), c (n,), d."""
 
-    @cached_property
-    def closed_length(self) -> int:
-        return len(self.motion)
-
-    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
-        return np.asarray(fft.rfft(values), np.complex128)
-
-    @cached_property
-    def _spectrum(self) -> ComplexArray:
-        return self.closed_spectrum(self.motion)
-
-    @cached_property
-    def s(self) -> ComplexArray:
-        angle = np.pi * fft.rfftfreq(self.closed_length)
-        return np.asarray(2j / self.period * np.tan(angle) / self.rate, np.complex128)
-
-    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """The motion, and a pulse at the first sample whose terms make any initial state."""
-        pulse = np.ones(len(self.s), np.complex128)
-        return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles)]
-
-    def with_initial_state(self, fitted: Fit) -> FloatArray:
-        """Output (n,) of a fit's dynamics, with initial state and offset fitted here."""
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
-        spectra = self._driven(fitted.structure, lag)
-        terms = len(fitted.numerator)
-        columns = fft.irfft(spectra, self.closed_length)[:, : len(self.motion)].T
-        moved = columns[:, :terms] @ fitted.driven[:terms]
-        free = np.column_stack([columns[:, terms:], self.background])
-        rest = (self.seen - moved)[self.used]
-        state = np.linalg.lstsq(free[self.used], rest, rcond=None)[0]
-        return np.asarray(moved + free @ state)
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    d: float
 
 
-@dataclass(frozen=True, eq=False)
-class HeldFit:
-    """order: poles;  delay: whole samples;  whitened: fitted with its residual made white
-    output: what the model says is seen (n,), a free run from its initial state
+def held_zeros(
+    zeros: ComplexArray, poles: ComplexArray, order: int, at_rest: int = 0
+) -> ComplexArray:
+    """Zeros in the z plane of the system with these roots, in radians a sample.
+
+    at_rest: zeros at s = 0, which the interpolation maps to z = 1 exactly if it reproduces
+        polynomials of that degree; among eigenvalues that coincide they would be blurred
     """
+    if not len(poles):
+        return np.empty(0, np.complex128)
+    system = _series(zeros, poles)
+    step, weights = _held_integrals(system.a, system.b, order)
+    n = len(step)
+    # States (x[k-1], u[k-1] … u[k-m]).
+    transition = np.block([[step, weights[:, 1:]], [np.zeros((order, n)), np.eye(order, k=-1)]])
+    entry = np.concatenate([weights[:, 0], np.eye(order)[0]])
+    leaving = np.concatenate([system.c @ step, system.c @ weights[:, 1:]])
+    direct = np.array([float(system.c @ weights[:, 0] + system.d)])
+    pencil = np.block([[transition, entry[:, np.newaxis]], [leaving, direct]])
+    found = linalg.eigvals(pencil, linalg.block_diag(np.eye(n + order), 0.0))
+    found = found[np.isfinite(found) & (abs(found) < _FAR_ZERO)]
+    found[np.argsort(abs(found - 1))[:at_rest]] = 1.0
+    upper = found[found.imag > 0]
+    return np.concatenate([upper, upper.conj(), found[found.imag == 0]])
 
-    order: int
-    delay: int
-    whitened: bool
-    output: FloatArray
 
-
-def identify_held(
-    command: FloatArray,
-    seen: FloatArray,
-    used: BoolArray,
-    period: float,
-    *,
-    order: int = 0,
-    delays: Sequence[int] = (0,),
-) -> HeldFit:
-    """Fit ``seen`` (n,) where ``used`` (n,) from a ``command`` (n,) held over ``period`` [s].
-
-    order: number of poles, 0 to choose it;  delays: whole samples to try. Both, and whether
-    to whiten the residual, are judged by a free run over the last third of the used
-    samples, fitted without it: whitening is efficient for a model that holds all the
-    dynamics, and harmful for one that cannot.
-
-    Raises IdentificationError when too few samples are used or one is not finite.
-    """
-    finite = np.all(np.isfinite(command)) and np.all(np.isfinite(seen[used]))
-    if not (np.sum(used) > 4 * _GREATEST_ORDER and finite):
-        raise IdentificationError(
-            f"{int(np.sum(used))!r} samples are used, more than {4 * _GREATEST_ORDER} finite "
-            "ones are needed"
+def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
+    """Sections in series; the gain is arbitrary."""
+    whole = _StateSpace(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+    for numerator, denominator in _sections(zeros, poles):
+        part = _section(numerator, denominator)
+        corner = np.zeros((len(whole.a), len(part.a)))
+        whole = _StateSpace(
+            np.block([[whole.a, corner], [np.outer(part.b, whole.c), part.a]]),
+            np.concatenate([whole.b, part.b * whole.d]),
+            np.concatenate([part.d * whole.c, part.c]),
+            part.d * whole.d,
         )
-    orders = [order] if order else range(1, _GREATEST_ORDER + 1)
-    check = used & (np.cumsum(used) > _FITTED_PART * np.sum(used))
-
-    def judged(found: HeldFit) -> float:
-        return float(np.sum((seen - found.output)[check] ** 2))
-
-    tried = [
-        found
-        for delay in delays
-        for found in _by_order(command, seen, used & ~check, period, delay, orders)
-    ]
-    best = _simplest(tried, [judged(found) for found in tried])
-    again = _by_order(command, seen, used, period, best.delay, [best.order])
-    return next(found for found in again if found.whitened == best.whitened)
+    return whole
 
 
-def _simplest(tried: Sequence[HeldFit], errors: Sequence[float]) -> HeldFit:
-    """The plainest of those that come close to the best: not whitened, then fewest poles."""
-    close = [f for f, error in zip(tried, errors, strict=True) if error <= _CLOSE * min(errors)]
-    return min(close, key=lambda f: (f.whitened, f.order, f.delay))
+def _sections(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Proper ratios of real polynomials, ascending and monic, of second order but for one."""
+    denominators = [*_quadratics(_pairs(poles)), *_by_two(_reals(poles))]
+    pairs, reals = _quadratics(_pairs(zeros)), _reals(zeros)
+    numerators = []
+    for denominator in denominators:
+        room = len(denominator) - 1
+        if room == 2 and pairs:
+            numerators.append(pairs.pop(0))
+        else:
+            taken, reals = reals[:room], reals[room:]
+            numerators.append(_expanded(taken))
+    return list(zip(numerators, denominators, strict=True))
 
 
-def _by_order(
-    command: FloatArray,
-    seen: FloatArray,
-    used: BoolArray,
-    period: float,
-    delay: int,
-    orders: Sequence[int],
-) -> list[HeldFit]:
-    centre = float(np.mean(seen[used]))
-    problem = _delayed(command, np.where(used, seen - centre, 0.0), used, period, delay)
-    static = fit(problem, Structure(0, 0, False), [np.empty(0)])
-    points = StartingPoints(problem, static, _NO_VOTE)
-    fits: list[Fit] = []
-    for poles in range(1, max(orders) + 1):
-        structure = Structure(poles, poles, False)
-        fits.append(fit(problem, structure, points.of(structure, fits)))
-    wanted = [f for f in fits if f.structure.poles in orders]
-    return [
-        HeldFit(f.structure.poles, delay, whitened, output(f) + centre)
-        for f in wanted
-        for whitened, output in (
-            (False, problem.with_initial_state),
-            (True, lambda g: _efficient(problem, g)),
-        )
-    ]
+def _pairs(roots: ComplexArray) -> ComplexArray:
+    upper = roots[roots.imag > 0]
+    return np.asarray(upper[np.argsort(abs(upper))], np.complex128)
 
 
-def _delayed(
-    command: FloatArray, seen: FloatArray, used: BoolArray, period: float, delay: int
-) -> HeldProblem:
-    late = np.roll(command, delay)
-    return HeldProblem(
-        motion=late - np.mean(late),
-        seen=seen,
-        used=used & (np.arange(len(used)) >= delay),
-        period=period,
-        background=np.ones((len(seen), 1)),
-        # Half way between the slowest and the fastest a sampled pole can be.
-        rate=0.5 / period,
-    )
+def _reals(roots: ComplexArray) -> FloatArray:
+    real = roots[roots.imag == 0].real
+    return np.asarray(real[np.argsort(abs(real))], np.float64)
 
 
-def _efficient(problem: HeldProblem, fitted: Fit) -> FloatArray:
-    """Output of the fit repeated with its coloured residual whitened, (n,).
+def _quadratics(upper: ComplexArray) -> list[FloatArray]:
+    return [np.array([abs(r) ** 2, -2 * r.real, 1.0]) for r in upper]
 
-    A whitening filter on both sides leaves G alone; only the initial state is found anew.
-    """
-    whitener, _ = autoregression(fitted.residual)
-    if len(whitener) > 1:
-        apart = np.arange(len(problem.used)) >= len(whitener)
-        lost = np.convolve(~problem.used, np.ones(len(whitener)))[: len(problem.used)] > 0.5
-        white = replace(
-            problem,
-            motion=signal.lfilter(whitener, 1.0, problem.motion),
-            seen=signal.lfilter(whitener, 1.0, problem.seen),
-            used=problem.used & apart & ~lost,
-        )
-        fitted = fit(white, fitted.structure, [fitted.shape])
-    return problem.with_initial_state(fitted)
+
+def _by_two(reals: FloatArray) -> list[FloatArray]:
+    return [_expanded(reals[i : i + 2]) for i in range(0, len(reals), 2)]
+
+
+def _expanded(roots: FloatArray) -> FloatArray:
+    return np.asarray(polynomial.polyfromroots(roots), np.float64)
+
+
+def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
+    """A ratio of first or second order, its states y and y'/ω, its output of a size near 1."""
+    n = len(denominator) - 1
+    omega = abs(denominator[0]) ** (1 / n)
+    powers = omega ** np.arange(n + 1)
+    padded = np.append(numerator, np.zeros(n + 1 - len(numerator))) * powers
+    padded /= max(abs(padded))
+    direct = float(padded[n])
+    # In units of ω the denominator is 1 + … + 1, monic at both ends.
+    monic = denominator * powers / powers[n]
+    c = padded[:n] - direct * monic[:n]
+    a = omega * np.eye(n, k=1)
+    a[-1] = -omega * monic[:n]
+    return _StateSpace(a, omega * np.eye(n)[-1], c, direct)
+
+
+def _held_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1] … in the step from k-1 to k."""
+    n = len(a)
+    # Driving states by a chain of integrators makes one exponential hold ∫ e^{a(1-v)} b v^j/j! dv.
+    chain = np.zeros((n + order + 1, n + order + 1))
+    chain[:n, :n] = a
+    chain[:n, n] = b
+    chain[n:, n:] = np.eye(order + 1, k=1)
+    exponential = linalg.expm(chain)
+    monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
+    nodes = 1.0 - np.arange(order + 1)
+    coefficients = np.linalg.inv(np.vander(nodes, increasing=True))
+    return exponential[:n, :n], np.asarray(monomials @ coefficients)

@@ -18,7 +18,7 @@ from omsm_ros.core.pairing import Run
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.core.uncertainty import differentiable, sensitivity_filters
+from omsm_ros.core.uncertainty import derivative_filter, sensitivity_filters
 
 # The share of a wrong start that may be left in the first published point.
 SETTLED = 1e-6
@@ -56,7 +56,9 @@ class MotionFilters:
         """The filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator) * lateral_lag_uncertainty
-        timing = differentiable(rate, g.denominator, g.delay, sample_period) if any(rate) else None
+        timing = None
+        if lateral_lag_uncertainty > 0:
+            timing = derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles())
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
         return cls(
             height=discretise(g, sample_period, order),

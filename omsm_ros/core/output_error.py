@@ -123,7 +123,7 @@ class Problem:
         lag, relative = scaled.lag(shape, self.s)
         driven = self._driven(scaled.structure, lag)
         columns = np.column_stack([self._in_time(driven).T, self._fixed])
-        basis, triangle = _orthonormal(columns)
+        basis, triangle = np.linalg.qr(columns)
         linear = _solve(triangle, basis.T @ self._target)
         residual = self._target - columns @ linear
         moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
@@ -152,24 +152,6 @@ class Problem:
         response = fitted.numerator @ driven
         by_dynamics = self._in_time(np.concatenate([driven[1:], relative * response])).T
         return np.column_stack([fitted.gain * by_dynamics, self._in_time(response), self._fixed])
-
-
-def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q (k, q) and R (q, q) of ``columns``, by Cholesky's factor of their products, twice.
-
-    Once loses the square of the condition, the second time restores it (Yamamoto et al.
-    2015); Householder's way is kept for what is too ill-conditioned even so.
-    """
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    basis, triangle = columns / scale, np.diag(scale)
-    try:
-        for _ in range(2):
-            factor = np.linalg.cholesky(basis.T @ basis).T
-            basis, triangle = basis @ np.linalg.inv(factor), factor @ triangle
-    except np.linalg.LinAlgError:
-        basis, triangle = np.linalg.qr(columns)
-    return basis, triangle
 
 
 def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:

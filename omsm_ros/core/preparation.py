@@ -157,10 +157,15 @@ def _with_background(problem: Problem, steps: Steps) -> tuple[Problem, int | Non
     background, backlash_column = problem.background, None
     play = backlash_columns(steps, len(ramp))
     for columns, is_backlash in ((np.column_stack([ramp**2, ramp**3]), False), (play, True)):
-        tried = np.column_stack([background, problem.motion, columns])[problem.used]
-        left = residual - tried @ np.linalg.lstsq(tried, residual, rcond=None)[0]
-        improved = (float(residual @ residual) - float(left @ left)) / np.mean(left**2)
+        known = np.column_stack([background, problem.motion])[problem.used]
+        left = _unexplained(residual, known)
+        after = _unexplained(residual, np.column_stack([known, columns[problem.used]]))
+        improved = (float(left @ left) - float(after @ after)) / np.mean(after**2)
         if columns.shape[1] and improved > _CLEARLY_SHOWN * columns.shape[1]:
             backlash_column = background.shape[1] if is_backlash else backlash_column
             background = np.column_stack([background, columns])
     return replace(problem, background=background), backlash_column
+
+
+def _unexplained(values: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.discretise import DigitalFilter, discretise
+from omsm_ros.core.discretise import DigitalFilter, bilinear, discretise
 from omsm_ros.core.records import FloatArray, SurfacePoints
 from omsm_ros.core.surface import Surface
-from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
 from omsm_ros.units import MICROMETRE_M
 
 # A direction of the covariance that adds less than this share of the variance is left out.
@@ -127,25 +127,35 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
     power = np.abs(polynomial.polyval(band, combined.T)) ** 2
     share = power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny)
     return [
-        differentiable(numerator, square, g.delay, sample_period)
+        derivative_filter(numerator, square, g.delay, sample_period, np.tile(g.poles(), 2))
         for numerator, largest in zip(combined, share.max(axis=1), strict=True)
         if largest > _NEGLIGIBLE
     ]
 
 
-def differentiable(
-    numerator: FloatArray, denominator: FloatArray, delay: float, sample_period: float
+def derivative_filter(
+    numerator: FloatArray,
+    denominator: FloatArray,
+    delay: float,
+    sample_period: float,
+    poles: ComplexArray,
 ) -> DigitalFilter:
     """A filter for a ratio whose numerator may exceed the denominator by one degree.
 
     Such a ratio, the derivative of a response that does not fall, gets a pole above the
-    Nyquist frequency: below a tenth of it that is 1 % of magnitude.
+    Nyquist frequency: below a tenth of it that is 1 % of magnitude. Where a resonance folds
+    to slow motion the bilinear transform, which does not fold, serves better here.
     """
     used = np.trim_zeros(numerator, "b")
     if len(used) > len(denominator):
-        above_nyquist = np.array([1.0, sample_period / 4])
-        denominator = np.asarray(polynomial.polymul(denominator, above_nyquist), np.float64)
-    return discretise(TransferFunction(used, denominator, delay), sample_period, _ORDER)
+        fast = np.array([1.0, sample_period / 4])
+        denominator = np.asarray(polynomial.polymul(denominator, fast), np.float64)
+        poles = np.append(poles, -4 / sample_period)
+    ratio = TransferFunction(used, denominator, delay)
+    try:
+        return discretise(ratio, sample_period, _ORDER, poles)
+    except DataError:
+        return bilinear(ratio, sample_period, poles)
 
 
 def sensitivity_numerators(calibration: Calibration) -> FloatArray:

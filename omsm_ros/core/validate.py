@@ -22,6 +22,8 @@ _LAGS = 25
 # After an edge the response is looked at for this long.
 _AFTER_EDGE_S = 50e-3
 _LEAST_REST_SAMPLES = 200
+# No probe tells less; a misfit below it is none.
+_FINEST_READING_M = 1e-10
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def residual_tests(
     active = problem.used & _active(steps, problem.period)
     rest = problem.used & ~active
     if noise is None:
-        noise = _noise(on_grid, problem.used, rest)
+        noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2
@@ -63,11 +65,10 @@ def _active(steps: Steps, period: float) -> BoolArray:
 
 
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
-    tiny = float(np.finfo(np.float64).tiny)
     if np.sum(rest) >= _LEAST_REST_SAMPLES:
-        return float(np.std(on_grid[rest])) or tiny
+        return float(np.std(on_grid[rest]))
     # No rest: white noise is what neighbouring samples do not share.
-    return float(np.sqrt(np.mean(np.diff(on_grid[used], 2) ** 2) / 6.0)) or tiny
+    return float(np.sqrt(np.mean(np.diff(on_grid[used], 2) ** 2) / 6.0))
 
 
 def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:

@@ -61,7 +61,7 @@ def quiet_scan() -> Recording:
 def part(block: Block, start: int, stop: int) -> Block:
     """Samples ``start`` to ``stop`` of a block, stamped as a driver would."""
     arrays = {
-        f.name: getattr(block, f.name)[start:stop]
+        f.name: getattr(block, f.name)[start:stop].copy()
         for f in fields(block)
         if isinstance(getattr(block, f.name), np.ndarray)
     }
@@ -357,6 +357,33 @@ def test_a_refused_block_leaves_the_account_as_it_was(scan: Recording) -> None:
     with pytest.raises(DataError, match="first_sample"):
         corrector.push_axes(replace(scan.axes, first_sample=2**63))
     assert corrector.account == Account()
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_whatever_the_network_does_every_sample_is_counted_and_no_point_is_wrong(
+    scan: Recording, data: st.DataObject
+) -> None:
+    """Blocks lost, repeated, swapped and overlapping, with holes in them, in both streams."""
+    corrector, taken = Corrector(CALIBRATION), []
+    starts = st.lists(st.integers(0, 3900), min_size=1, max_size=25)
+    for axes_start, probe_start in zip(data.draw(starts), data.draw(starts), strict=False):
+        length, hole = data.draw(st.integers(1, 400)), data.draw(st.integers(0, 399))
+        axes = part(scan.axes, axes_start, axes_start + length)
+        distance = part(scan.distance, probe_start, probe_start + length)
+        if hole < length and hole % 3 == 0:
+            axes.z[hole], distance.distance[hole] = np.nan, np.inf  # type: ignore[attr-defined]
+        corrector.push_axes(axes)  # type: ignore[arg-type]
+        corrector.push_distance(distance)  # type: ignore[arg-type]
+        taken.append(corrector.take())
+        assert balanced(corrector.account.axes)
+        assert balanced(corrector.account.distance)
+    points = join_points([*taken, corrector.finish()])
+    account = corrector.account
+    assert account.axes.pending == account.distance.pending == 0
+    assert account.axes.corrected == account.distance.corrected == len(points)
+    assert balanced(account.axes)
+    assert np.all(abs(points.height - scan.surface_height[points.sample]) < 100e-9)
 
 
 def test_after_finish_a_new_scan_may_begin(scan: Recording) -> None:

@@ -6,12 +6,14 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 from scipy import signal
 
 from omsm_ros.core.discretise import bilinear, discretise
 from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.plant import PAPER_EQ_12
 
 PAPER = PAPER_EQ_12.normalised()
@@ -148,3 +150,43 @@ def test_an_order_out_of_range_is_named(order: int) -> None:
 def test_an_impossible_period_is_named(period: float) -> None:
     with pytest.raises(ConfigurationError, match="sample_period"):
         discretise(PAPER, period)
+
+
+modes = st.tuples(st.floats(5.0, 200.0), st.floats(0.02, 1.0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    poles=st.lists(modes, min_size=1, max_size=3),
+    zeros=st.lists(modes, max_size=1),
+    lag=st.sampled_from([None, 3.0, 40.0, 4000.0]),
+    delay=st.sampled_from([0.0, 0.34e-3, 4e-3]),
+    period=st.sampled_from([1e-3, 1e-4, 1 / 70e3]),
+)
+def test_any_resonances_below_nyquist_are_followed(
+    poles: list[tuple[float, float]],
+    zeros: list[tuple[float, float]],
+    lag: float | None,
+    delay: float,
+    period: float,
+) -> None:
+    numerator, denominator = np.ones(1), np.ones(1)
+    for mode in poles:
+        denominator = polynomial.polymul(denominator, second_order(*mode).denominator)
+    for mode in zeros:
+        numerator = polynomial.polymul(numerator, second_order(*mode).denominator)
+    if lag is not None:
+        denominator = polynomial.polymul(denominator, [1.0, 1 / (2 * np.pi * lag)])
+    dynamics = TransferFunction(numerator, denominator, delay)
+    digital = discretise(dynamics, period)
+    error = abs(digital.response(BAND[:3]) - dynamics.response(BAND[:3]))
+    assert np.all(error < 1e-6 * np.maximum(abs(dynamics.response(BAND[:3])), 1.0))
+    assert np.max(abs(digital.poles)) < 1
+
+
+def test_a_resonance_that_folds_to_slow_motion_is_refused() -> None:
+    # A sharp and strong mode close to the sample rate looks like slow motion itself.
+    sharp = second_order(998.4, 1e-3).denominator
+    strong = TransferFunction(second_order(5.0, 1.0).denominator, sharp)
+    with pytest.raises(DataError, match=r"0\.001 s.*off by more than 1%"):
+        discretise(strong, 1e-3)

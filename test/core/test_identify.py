@@ -25,17 +25,19 @@ from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 STAND_OFF = -49e-6
-TRUTH = Plant().dynamics
+STEPS, PLANT = StepTest(), Plant()
+TRUTH = PLANT.dynamics
 
 
 @lru_cache(maxsize=64)
-def recorded(seed=1, motion=StepTest(), plant=Plant(), sample_period=1e-3, drift=0.0):
+def recorded(seed=1, motion=STEPS, plant=PLANT, sample_period=1e-3, drift=0.0):
     cell = Cell(plant=plant, seed=seed, sample_period=sample_period, drift=drift)
     return record(cell, motion, Flat(), stand_off=STAND_OFF)
 
 
 def record_of(recording, **changed):
-    arrays = {"z": recording.axes.z, "distance": recording.distance.distance, **changed}
+    seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
+    arrays = {"z": recording.axes.z, "distance": seen, **changed}
     return MotionRecord.from_arrays(recording.axes.sample_period, **arrays)
 
 
@@ -221,14 +223,14 @@ class TestImperfectData:
         coloured = signal.lfilter([1.0], [1.0, -0.8], rng.normal(0, 5e-9, n))
         distance = recording.distance.distance + coloured
         distance[rng.random(n) < 0.05] = np.nan
-        distance[::997] += 2e-6
+        distance[::997] += 2e-6  # ten of them, some lost with their neighbours
         calibration = identify(record_of(recording, distance=distance))
         frequency = np.array([1.0, 15.0])
         band = response_band(calibration.dynamics, calibration.covariance, frequency)
         gain, phase = errors(calibration, TRUTH, frequency)
         assert np.all(np.abs(gain) < 4 * band.gain)
         assert np.all(np.abs(phase) < 4 * band.phase)
-        assert calibration.certificate["samples"]["spikes"] >= 8
+        assert calibration.certificate["samples"]["spikes"] >= 6
         assert calibration.certificate["drift_m_s"] == pytest.approx(
             PAPER_STATIC_GAIN * 100e-9 / 60, rel=0.5
         )
@@ -303,7 +305,7 @@ class TestRefusals:
         self.refuse(StepTestError, "no steps", np.zeros(5000), np.zeros(5000))
 
     def test_nothing_but_nan(self):
-        z, distance = self.arrays()
+        z, _ = self.arrays()
         self.refuse(StepTestError, "0 of 10500 samples are usable", z, np.full(len(z), np.nan))
         self.refuse(StepTestError, "0 of 10500 samples are usable", np.full(len(z), np.nan), z)
 
@@ -314,7 +316,7 @@ class TestRefusals:
         self.refuse(StepTestError, "metres", z * 1e6, distance)
 
     def test_a_probe_that_does_not_follow(self):
-        z, distance = self.arrays()
+        z, _ = self.arrays()
         still = np.random.default_rng(1).normal(0, 1e-8, len(z))
         self.refuse(IdentificationError, "expected about 1", z, still)
         self.refuse(IdentificationError, "expected about 1", z, np.zeros(len(z)))

@@ -152,6 +152,4 @@ def test_nan_in_an_array_is_a_lost_sample():
 
 def test_channels_of_different_lengths_are_refused():
     with pytest.raises(DataError, match="different lengths"):
-        MotionRecord(
-            sample_period=1e-3, z=np.zeros(5), distance=np.zeros(4), ok=np.ones(5, bool)
-        )
+        MotionRecord(sample_period=1e-3, z=np.zeros(5), distance=np.zeros(4), ok=np.ones(5, bool))

@@ -76,7 +76,9 @@ def test_a_shape_of_poles_has_those_poles():
     poles = np.array([-1 + 3j, -1 - 3j, -0.5, -4.0, -9.0], complex)
     scaled = Scaled(Structure(5, 0, True), 200.0)
     g = scaled.transfer_function(scaled.shape_of(poles, 0.25), np.ones(1))
-    np.testing.assert_allclose(np.sort_complex(g.poles() / 200.0), np.sort_complex(poles), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.sort_complex(g.poles() / 200.0), np.sort_complex(poles), rtol=1e-6
+    )
     assert g.delay == pytest.approx(0.25 / 200)
 
 

@@ -151,6 +151,19 @@ def test_a_delay_of_a_response_that_does_not_fall_is_differentiated_too() -> Non
     assert np.allclose(abs(found.response(frequency)), expected, rtol=0.02)
 
 
+def test_a_sharp_resonance_near_the_sample_rate_still_has_sensitivities() -> None:
+    omega = 2 * np.pi * 833.0
+    sharp = TransferFunction(np.ones(1), np.array([1.0, 2 * 0.01 / omega, 1 / omega**2]))
+    covariance = np.diag([0.0, 1e-12, 1e-16, 0.0])
+    found = sensitivity_filters(calibration(covariance, dynamics=sharp), PERIOD)
+    frequency = np.array([1.0, 10.0])
+    s = 2j * np.pi * frequency
+    squared = sharp.response(frequency) ** 2
+    expected = np.sqrt(abs(1e-6 * s * squared) ** 2 + abs(1e-8 * s**2 * squared) ** 2)
+    total = np.sqrt(sum(abs(f.response(frequency)) ** 2 for f in found))
+    assert np.allclose(total, expected, rtol=0.02)
+
+
 def test_a_known_response_needs_no_filters() -> None:
     assert sensitivity_filters(calibration(np.zeros((7, 7))), PERIOD) == []
 

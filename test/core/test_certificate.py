@@ -1,0 +1,67 @@
+"""The verdict, from evidence made up to be good or bad in one respect."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.certificate import Evidence, certify
+from omsm_ros.core.hankel import HankelVote
+from omsm_ros.core.order import Candidate
+from omsm_ros.core.structure import Structure
+from omsm_ros.core.transfer_function import TransferFunction
+
+GOOD = Evidence(
+    chi_square=1.0,
+    residual_rms=1e-8,
+    noise=1e-8,
+    whiteness=0.5,
+    independence=0.5,
+    valid_up_to=80.0,
+    nyquist=500.0,
+    delay_noise=1e-6,
+    delay_uncertainty=1e-6,
+    inter_sample_delay_bound=1e-8,
+    edges=20,
+)
+SLOW = TransferFunction.from_ascending([1.0], [1.0, 1e-2])
+FAST = TransferFunction.from_ascending([1.0], [1.0, 1e-4])
+
+
+def certificate(evidence, dynamics=SLOW):
+    fit = SimpleNamespace(structure=Structure(1, 0, False), rms=1e-8)
+    chosen = Candidate(fit, -1.0, 1e-8)
+    vote = HankelVote(np.array([2.0, 0.5]), 1, np.empty(0, complex))
+    return certify(dynamics, chosen, [chosen], vote, evidence, {"polarity": 1})
+
+
+def test_good_evidence_is_accepted_as_far_as_it_goes():
+    assert certificate(GOOD)["verdict"] == "accepted up to 80 Hz"
+    assert certificate(replace(GOOD, valid_up_to=500.0))["verdict"] == "accepted"
+    assert certificate(GOOD)["reasons"] == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"chi_square": 2.0}, "misses something"),
+        ({"valid_up_to": 1.0}, "more or larger steps"),
+        ({"inter_sample_delay_bound": 5e-6}, "between samples"),
+    ],
+)
+def test_bad_evidence_is_rejected_by_name(changed, reason):
+    rejected = certificate(replace(GOOD, **changed))
+    assert rejected["verdict"] == "rejected"
+    (text,) = rejected["reasons"]
+    assert reason in text
+
+
+def test_a_pole_beyond_the_trusted_band_is_warned_of():
+    (text,) = certificate(GOOD, FAST)["warnings"]
+    assert "1592 Hz" in text
+    assert certificate(GOOD, SLOW)["warnings"] == []
+
+
+def test_further_values_are_kept():
+    assert certificate(GOOD)["polarity"] == 1

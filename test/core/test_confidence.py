@@ -1,0 +1,119 @@
+"""Covariance and band, against Monte Carlo and finite differences."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from omsm_ros.core.confidence import (
+    Band,
+    ResponseLimits,
+    autoregression,
+    hidden_motion_covariance,
+    noise_spectrum,
+    parameter_covariance,
+    relative_response_jacobian,
+    response_band,
+    trusted_up_to,
+)
+from omsm_ros.core.output_error import Problem
+from omsm_ros.core.transfer_function import TransferFunction
+
+G = TransferFunction([1.0, -2e-4, 1e-7], [1.0, 1e-4, 4e-8, 1e-12], 1e-4)
+
+
+def problem_for(samples, used=None):
+    used = np.ones(samples, bool) if used is None else used
+    return Problem(np.zeros(samples), np.zeros(samples), used, 1e-3, np.ones((samples, 1)), 1.0)
+
+
+def coloured(rng, samples, pole):
+    return signal.lfilter([1.0], [1.0, -pole], rng.normal(size=samples + 200))[200:]
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.8])
+def test_covariance_is_that_of_repeated_fits(pole):
+    samples, rng = 800, np.random.default_rng(1)
+    used = rng.random(samples) > 0.1
+    time = np.linspace(0, 1, samples)
+    columns = np.column_stack([np.ones(samples), np.sin(2 * np.pi * 3 * time)])[used]
+    fits, stated = [], []
+    for _ in range(300):
+        noise = coloured(rng, samples, pole)[used]
+        solved = np.linalg.lstsq(columns, noise, rcond=None)[0]
+        fits.append(solved)
+        residual = noise - columns @ solved
+        stated.append(np.diag(parameter_covariance(problem_for(samples, used), columns, residual)))
+    np.testing.assert_allclose(np.mean(stated, axis=0), np.var(fits, axis=0), rtol=0.3)
+
+
+def test_white_noise_needs_no_autoregression():
+    orders = [len(autoregression(np.random.default_rng(s).normal(size=2000))[0]) for s in range(20)]
+    assert np.sum(np.array(orders) > 1) <= 2
+
+
+def test_an_autoregression_is_recognised():
+    filter_, variance = autoregression(coloured(np.random.default_rng(2), 20_000, 0.7))
+    assert filter_[1] == pytest.approx(-0.7, abs=0.03)
+    assert variance == pytest.approx(1.0, rel=0.05)
+
+
+def test_noise_spectrum_has_the_variance_of_the_noise():
+    noise = coloured(np.random.default_rng(3), 20_000, 0.7)
+    spectrum = noise_spectrum(noise, 4096)
+    mean = (2 * np.sum(spectrum[1:-1]) + spectrum[0] + spectrum[-1]) / 4096
+    assert mean == pytest.approx(np.var(noise), rel=0.05)
+
+
+def test_no_residual_means_no_variance():
+    assert np.all(noise_spectrum(np.zeros(100), 64) == 0)
+
+
+def test_response_jacobian_is_that_of_finite_differences():
+    frequency = np.array([1.0, 30.0, 200.0])
+    jacobian = relative_response_jacobian(G, frequency)
+    start = np.concatenate([G.numerator, G.denominator[1:], [G.delay]])
+
+    def log_response(vector):
+        g = TransferFunction(vector[:3], np.concatenate([[1.0], vector[3:6]]), vector[6])
+        return np.log(g.response(frequency))
+
+    for k, value in enumerate(start):
+        step = np.zeros(7)
+        step[k] = 1e-3 * abs(value)
+        slope = (log_response(start + step) - log_response(start - step)) / (2 * step[k])
+        found = jacobian[0, :, k] + 1j * jacobian[1, :, k]
+        assert np.all(np.abs(found - slope) < 1e-3 * np.abs(slope))
+
+
+def test_an_uncertain_delay_is_an_uncertain_phase_only():
+    covariance = np.zeros((7, 7))
+    covariance[6, 6] = (1e-6) ** 2
+    band = response_band(G, covariance, np.array([10.0, 100.0]))
+    np.testing.assert_allclose(band.phase, 2 * np.pi * np.array([10.0, 100.0]) * 1e-6)
+    np.testing.assert_allclose(band.gain, 0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "dynamics",
+    [G, TransferFunction([1.0], [1.0, 1e-3]), TransferFunction([1.0], [1.0], 3e-4)],
+)
+def test_hidden_motion_is_a_delay_at_low_frequency(dynamics):
+    covariance = hidden_motion_covariance(dynamics, 3e-6, 1e-3)
+    band = response_band(dynamics, covariance, np.array([0.01]))
+    assert band.phase[0] == pytest.approx(2 * np.pi * 0.01 * 3e-6 / np.sqrt(3), rel=1e-3)
+
+
+def test_trust_ends_where_the_band_leaves_its_limits():
+    frequency = np.linspace(1, 100, 100)
+    band = Band(frequency, 1e-4 * frequency, np.zeros(100))
+    limits = ResponseLimits(gain=1e-4 * 50 * 1.959964 + 1e-9)
+    assert trusted_up_to(band, limits) == 50
+    assert trusted_up_to(band, ResponseLimits(gain=1.0)) == 100
+    assert trusted_up_to(band, ResponseLimits(gain=1e-9)) == 0
+
+
+def test_a_known_disagreement_narrows_the_trust():
+    frequency = np.linspace(1, 100, 100)
+    quiet = Band(frequency, np.zeros(100), np.zeros(100))
+    other = Band(frequency, 1e-3 * frequency, np.zeros(100))
+    assert trusted_up_to(quiet, ResponseLimits(gain=0.02001), other) == 20

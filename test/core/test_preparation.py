@@ -1,0 +1,69 @@
+"""What is decided before any model exists."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.motion_record import MotionRecord
+from omsm_ros.core.preparation import content_frequency, prepare
+from omsm_ros.core.trajectory import StepTest
+from omsm_ros.errors import IdentificationError
+
+TIME = np.arange(round(StepTest().duration / 1e-3)) * 1e-3
+STEPS = StepTest().positions(TIME).z
+
+
+def record_of(extra=0.0, gain=1.0, lost=None, seed=1):
+    rng = np.random.default_rng(seed)
+    distance = 3e-6 - gain * STEPS + rng.normal(0, 1e-8, len(STEPS)) + extra
+    if lost is not None:
+        distance[lost] = np.nan
+    return MotionRecord.from_arrays(1e-3, STEPS + rng.normal(0, 4e-10, len(STEPS)), distance)
+
+
+def test_single_spikes_are_taken_out_and_counted():
+    spikes = np.zeros(len(STEPS))
+    spikes[[700, 1300, 5222]] = [1e-6, -5e-7, 2e-6]
+    prepared = prepare(record_of(spikes), "encoder")
+    assert prepared.spikes == 3
+    assert not np.any(prepared.problem.used[[700, 1300, 5222]])
+
+
+def test_edges_are_no_spikes():
+    assert prepare(record_of(), "encoder").spikes == 0
+
+
+def test_lost_samples_are_not_used():
+    prepared = prepare(record_of(lost=slice(2000, 2100)), "encoder")
+    assert not np.any(prepared.problem.used[2000:2100])
+    assert np.sum(prepared.problem.used) > 10_000
+
+
+def test_a_bent_drift_gets_its_columns_and_a_straight_one_does_not():
+    straight = prepare(record_of(1e-7 * TIME / TIME[-1]), "encoder")
+    bent = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")
+    assert straight.problem.background.shape[1] == 2
+    assert bent.problem.background.shape[1] == 4
+
+
+def test_backlash_gets_its_column():
+    direction = np.where(TIME < 5.5, 20e-9, -20e-9)
+    prepared = prepare(record_of(direction), "encoder")
+    assert prepared.backlash_column is not None
+    assert prepare(record_of(), "encoder").backlash_column is None
+
+
+def test_the_probes_gain_must_be_plausible():
+    prepare(record_of(gain=-0.9), "encoder")
+    with pytest.raises(IdentificationError, match="expected about 1"):
+        prepare(record_of(gain=0.3), "encoder")
+
+
+def test_a_quantised_probe_is_not_taken_for_a_clipped_one():
+    coarse = MotionRecord.from_arrays(1e-3, STEPS, np.round(-STEPS / 1e-7) * 1e-7)
+    assert prepare(coarse, "encoder").problem.used.any()
+
+
+def test_content_frequency_is_that_of_the_motion():
+    time = np.arange(10_000) * 1e-3
+    assert content_frequency(np.sin(2 * np.pi * 7 * time), 1e-3) == pytest.approx(7.0, abs=0.3)
+    assert content_frequency(STEPS, 1e-3) > 30
