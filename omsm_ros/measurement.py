@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from omsm_ros import __version__, offline
 from omsm_ros.core import form
 from omsm_ros.core.applicability import admit, objections
+from omsm_ros.core.audit import discretisation_error
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.correct import CorrectionOptions
+from omsm_ros.core.discretise import discretise
 from omsm_ros.core.predict import predict_error
 from omsm_ros.core.surface import Surface
 from omsm_ros.errors import DataError
@@ -48,11 +50,13 @@ def measure(
     nominal: Surface | None = None,
     options: CorrectionOptions | None = None,
     admission: Admission | None = None,
+    lateral: float = 0.0,
     report: bool = True,
     progress: offline.Progress = offline.no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
 
+    lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
@@ -64,11 +68,18 @@ def measure(
     )
     admitted = admit(calibration, reasons, asked.override)
     comment = "; ".join(["OVERRIDDEN", *reasons]) if reasons else ""
-    account = offline.correct_bag(
-        bag, calibration, out / CLOUD, options=options, comment=comment, progress=progress
+    done = offline.correct_bag(
+        bag,
+        calibration,
+        out / CLOUD,
+        options=options,
+        nominal=nominal,
+        lateral=lateral,
+        comment=comment,
+        progress=progress,
     )
     cloud = open_ply(out / CLOUD)
-    summary = summarise(bag, account, cloud, calibration, nominal)
+    summary = summarise(bag, done, cloud, calibration, nominal)
     summary["admission"] = admitted
     summary["warnings"] += [f"overridden: {reason}" for reason in reasons]
     if report:
@@ -85,7 +96,7 @@ def measure(
 
 def summarise(
     bag: Path,
-    account: Mapping[str, Any],
+    done: offline.Correction,
     cloud: NDArray[np.void],
     calibration: Calibration,
     nominal: Surface | None,
@@ -95,7 +106,9 @@ def summarise(
         "schema": "omsm-summary/1",
         "bag": str(bag),
         "calibration": calibration.id,
-        "samples": dict(account),
+        "samples": done.account,
+        "uncertainty_budget": done.budget,
+        "stamp_skew": done.stamp_skew,
         "settings": dict(calibration.settings),
         "versions": {
             "omsm_ros": __version__,
@@ -104,24 +117,30 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY},
     }
-    summary["warnings"] = _warnings(bag, calibration, len(cloud))
-    return summary | _figures_of_merit(cloud, nominal)
+    if not len(cloud):
+        return summary | {"warnings": ["not one sample could be corrected; see the reasons"]}
+    return summary | _motion_judged(bag, calibration) | _figures_of_merit(cloud, nominal)
 
 
-def _warnings(bag: Path, calibration: Calibration, points: int) -> list[str]:
-    if not points:
-        return ["not one sample could be corrected; see the reasons"]
+def _motion_judged(bag: Path, calibration: Calibration) -> dict[str, Any]:
+    """Was the scan slow enough to be trusted, and how good was H on its motion?"""
     try:
         z, period = offline.motion_in(bag, most=_MOST_JUDGED)
         prediction = predict_error(calibration, z, period)
+        digital = discretise(calibration.dynamics, period)
+        rms, spread = discretisation_error(
+            calibration.dynamics, digital, z, calibration.valid_up_to
+        )
     except DataError as err:
-        return [f"the motion could not be judged: {err}"]
-    return [] if prediction.safe else [prediction.message]
+        return {"warnings": [f"the motion could not be judged: {err}"]}
+    return {
+        "warnings": [] if prediction.safe else [prediction.message],
+        "prediction": asdict(prediction),
+        "discretisation": {"rms": rms, "peak_to_valley": spread},
+    }
 
 
 def _figures_of_merit(cloud: NDArray[np.void], nominal: Surface | None) -> dict[str, Any]:
-    if not len(cloud):
-        return {}
     running = {name: form.RunningStatistics() for name in ("error", "raw", "corrected")}
     largest = 0.0
     for start in range(0, len(cloud), _PORTION):

@@ -21,10 +21,13 @@ from omsm_ros.core.records import (
     Block,
     DistanceBlock,
     FloatArray,
+    SurfacePoints,
     follows,
     join_axes,
     join_distance,
 )
+from omsm_ros.core.surface import Surface
+from omsm_ros.core.uncertainty import with_lateral
 from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.files import PlyWriter
 
@@ -62,17 +65,34 @@ def sample_period_of(path: Path) -> float:
     raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a scan")
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What became of a bag.
+
+    account: of every sample, by stream;  budget: rms of each source of uncertainty [m]
+    stamp_skew: of the two streams' stamps for the same trigger [s], None if none was paired
+    """
+
+    account: dict[str, Any]
+    budget: dict[str, float]
+    stamp_skew: float | None
+
+
 def correct_bag(
     path: Path,
     calibration: Calibration,
     cloud: Path,
     *,
     options: CorrectionOptions | None = None,
+    nominal: Surface | None = None,
+    lateral: float = 0.0,
     comment: str = "",
     progress: Progress = no_progress,
-) -> dict[str, object]:
-    """Correct a bag into ``cloud`` (PLY) and return the account of its samples.
+) -> Correction:
+    """Correct a bag into ``cloud`` (PLY).
 
+    nominal, lateral: surface, and standard uncertainty of a point sideways [m], which costs
+        height where the surface slopes
     Memory does not grow with the bag. Leaves no cloud behind when it fails.
     """
     corrector = Corrector(calibration, options or CorrectionOptions())
@@ -82,17 +102,21 @@ def correct_bag(
         PlyWriter(cloud, f"omsm_ros, metres, calibration {calibration.id} {comment}") as ply,
     ):
         total = bag.count(topics)
+
+        def write(points: SurfacePoints | None) -> None:
+            if points is not None:
+                ply.write(with_lateral(points, nominal, lateral) if nominal and lateral else points)
+
         for done, record in _gathered(bag.records(*topics)):
             if isinstance(record, AxisBlock):
                 corrector.push_axes(record)
             elif isinstance(record, DistanceBlock):
                 corrector.push_distance(record)
-            if (points := corrector.take()) is not None:
-                ply.write(points)
+            write(corrector.take())
             progress(done, total)
-        if (rest := corrector.finish()) is not None:
-            ply.write(rest)
-    return dict(corrector.account.as_dict())
+        write(corrector.finish())
+    account = dict(corrector.account.as_dict())
+    return Correction(account, corrector.budget, corrector.stamp_skew)
 
 
 def _gathered(records: Iterable[bags.Item]) -> Iterator[tuple[int, Block]]:

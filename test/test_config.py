@@ -9,6 +9,7 @@ import yaml
 
 import omsm_ros
 from omsm_ros.core.kinematics import Geometry
+from omsm_ros.core.uncertainty import ErrorSources
 from omsm_ros.files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
@@ -24,7 +25,8 @@ def _declared(node):
             if isinstance(name, ast.Constant):
                 yield name.value
             elif isinstance(name.values[0], ast.Constant):  # f"geometry.{name}"
-                yield from (f"{name.values[0].value}{field.name}" for field in fields(Geometry))
+                group = {"geometry.": Geometry, "sources.": ErrorSources}[name.values[0].value]
+                yield from (f"{name.values[0].value}{field.name}" for field in fields(group))
             else:  # f"{axis}.counts_per_unit"
                 yield from (f"{axis}{name.values[1].value}" for axis in "xyzbc")
 

@@ -11,6 +11,7 @@ from omsm_ros.cli.command import Command, Facts, json_object, positive, progress
 from omsm_ros.core.correct import CorrectionOptions
 from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.predict import DEFAULT_BUDGET_M, predict_error
+from omsm_ros.core.uncertainty import sources_with
 from omsm_ros.files import load_calibration, load_geometry, load_surface
 from omsm_ros.measurement import Admission, measure
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
@@ -54,6 +55,16 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
     sub.add_argument("--lateral-lag", type=float, help="of the probe against X and C [s]")
+    sub.add_argument(
+        "--sources",
+        type=json_object,
+        default={},
+        metavar="JSON",
+        help='other standard uncertainties, e.g. {"encoder_noise": 4e-10}',
+    )
+    sub.add_argument(
+        "--lateral", type=positive, default=0.0, help="standard uncertainty of x and y [m]"
+    )
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
     sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
@@ -70,6 +81,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         accept_other_rate=args.override,
         lateral_lag=args.lateral_lag,
         geometry=geometry_of(args.geometry),
+        sources=sources_with(calibration, args.sources),
     )
     with progress_bar("correcting", args.json) as progress:
         return measure(
@@ -79,6 +91,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             nominal=nominal,
             options=options,
             admission=Admission(args.settings, args.override),
+            lateral=args.lateral,
             report=not args.no_report,
             progress=progress,
         )

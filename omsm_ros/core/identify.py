@@ -37,7 +37,7 @@ from omsm_ros.core.static_gain import static_gains
 from omsm_ros.core.step_test import held_out
 from omsm_ros.core.structure import Structure
 from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.core.validate import residual_tests, response_agreement
+from omsm_ros.core.validate import noise_colour, residual_tests, response_agreement
 from omsm_ros.errors import StepTestError
 
 DEFAULT_LIMITS = ResponseLimits()
@@ -121,7 +121,8 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
-    candidates = explore(fit_structure, vote.order, order)
+    colour = noise_colour(problem, lag, prepared.steps)
+    candidates = explore(fit_structure, vote.order, order, colour)
     held = held_out(prepared.steps, len(problem.motion))
     chosen, candidates = choose(candidates, lambda f: held_out_rms(problem, f, held))
     return Model(chosen, candidates, vote)

@@ -31,6 +31,7 @@ class MotionRecord:
     distance: probe [m], NaN where it has no reading
     ok: True where both are measured and to be trusted
     reference: second sensor along the same motion [m], NaN where it has no reading, or None
+    z_lost: True where z is interpolated, or None where it never is
     counts: what became of every sample received
 
     Raises DataError when the arrays do not fit each other.
@@ -41,6 +42,7 @@ class MotionRecord:
     distance: FloatArray
     ok: BoolArray
     reference: FloatArray | None = None
+    z_lost: BoolArray | None = None
     counts: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -80,6 +82,7 @@ class MotionRecord:
             distance=distance,
             ok=usable,
             reference=None if reference is None else np.asarray(reference, np.float64),
+            z_lost=None if np.all(known) else ~known,
             counts={
                 "received": len(z),
                 "missing_axis": int(np.sum(~known)),
@@ -191,6 +194,7 @@ def _by_counter(
         distance=seen,
         ok=z_known & seen_ok,
         reference=_on_grid(_distance_stream(reference), first, samples)[0] if reference else None,
+        z_lost=None if np.all(z_known) else ~z_known,
         counts=_counts(axis, probe, int(np.sum(present)), int(np.sum(z_known & seen_ok)))
         | {"missing_axis": samples - len(axis.counter)},
     )
@@ -276,6 +280,7 @@ def _by_stamp(
         z=np.asarray(interpolate.CubicSpline(axis_time, axis.value[axis.ok])(grid)),
         distance=seen,
         ok=seen_ok & covered,
+        z_lost=None if np.all(covered) else ~covered,
         reference=second,
         counts=_counts(axis, probe, int(np.sum(inside)), int(np.sum(seen_ok & covered))),
     )

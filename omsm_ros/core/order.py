@@ -51,19 +51,30 @@ class Candidate:
     held_out: float = float("nan")
 
 
-def information(fit: Fit) -> float:
-    """Bayesian information criterion, -2 log likelihood + size · log n."""
+def information(fit: Fit, colour: float = 1.0) -> float:
+    """Bayesian information criterion, -2 log likelihood + colour · size · log n.
+
+    colour: power of the noise at low frequency over its mean. Of coloured noise a slow
+        parameter explains that much more by chance, and has to explain it to be believed.
+    """
     n = fit.samples
     floor = np.finfo(np.float64).tiny
-    return float(n * np.log(max(fit.sum_of_squares, floor) / n) + fit.structure.size * np.log(n))
+    return float(
+        n * np.log(max(fit.sum_of_squares, floor) / n) + colour * fit.structure.size * np.log(n)
+    )
 
 
 def explore(
-    fit_structure: Callable[[Structure, Sequence[Fit]], Fit], at_least: int, forced: int
+    fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
+    at_least: int,
+    forced: int,
+    colour: float = 1.0,
 ) -> list[Candidate]:
     """Fit structure after structure; stop when two more poles in a row gain nothing.
 
     at_least: number of poles to go to in any case;  forced: only this many, if not 0
+    colour: of the noise, see :func:`information`
+
     Raises IdentificationError for a forced order that is no number of poles to try.
     """
     if not 0 <= forced <= MAX_POLES:
@@ -72,9 +83,9 @@ def explore(
     fruitless = 0
     for poles in range(forced + 1) if forced else range(MAX_POLES + 1):
         before = min((c.bic for c in found), default=np.inf)
-        for structure in _promising(poles, found, fit_structure):
+        for structure in _promising(poles, found, fit_structure, colour):
             fitted = fit_structure(structure, [c.fit for c in found])
-            found.append(Candidate(fitted, information(fitted)))
+            found.append(Candidate(fitted, information(fitted, colour)))
         fruitless = 0 if min(c.bic for c in found) < before else fruitless + 1
         if not forced and fruitless >= 2 and poles > at_least:
             break
@@ -85,6 +96,7 @@ def _promising(
     poles: int,
     found: list[Candidate],
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
+    colour: float,
 ) -> list[Structure]:
     """The structures with ``poles`` that may yet win.
 
@@ -96,9 +108,9 @@ def _promising(
         return every
     largest = fit_structure(every[-1], [c.fit for c in found])
     best = min(c.bic for c in found)
-    found.append(Candidate(largest, information(largest)))
-    per_parameter = np.log(largest.samples)
-    free = information(largest) - largest.structure.size * per_parameter
+    found.append(Candidate(largest, information(largest, colour)))
+    per_parameter = colour * np.log(largest.samples)
+    free = information(largest, colour) - largest.structure.size * per_parameter
     return [s for s in every[:-1] if free + s.size * per_parameter < best]
 
 

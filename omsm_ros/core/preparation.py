@@ -12,7 +12,7 @@ import numpy as np
 
 from omsm_ros.core.motion_record import MotionRecord
 from omsm_ros.core.output_error import Problem, fit
-from omsm_ros.core.records import FloatArray
+from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.step_test import (
     Steps,
     backlash_columns,
@@ -56,7 +56,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     """
     check_usable(record)
     motion = _motion(record, source)
-    steps = find_steps(motion, record.sample_period)
+    steps = _seen_whole(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps.noise)
     check_gain(_static_gain(problem))
     _check_not_clipped(problem)
@@ -83,7 +83,7 @@ def _motion(record: MotionRecord, source: str) -> FloatArray:
 
 def _problem(record: MotionRecord, motion: FloatArray, noise: float) -> Problem:
     samples = len(record)
-    used = record.ok.copy()
+    used = record.ok & ~_after_loss(record)
     used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
     seen = np.where(record.ok, record.distance, 0.0)
@@ -97,6 +97,25 @@ def _problem(record: MotionRecord, motion: FloatArray, noise: float) -> Problem:
         rate=2 * np.pi * content_frequency(motion, record.sample_period),
         noise=noise,
     )
+
+
+def _after_loss(record: MotionRecord) -> BoolArray:
+    """True where the response still remembers a motion that was lost, shape (n,)."""
+    samples = len(record)
+    if record.z_lost is None:
+        return np.zeros(samples, np.bool_)
+    memory = np.ones(round(_SETTLING_S / record.sample_period) + _EDGE_GUARD + 1)
+    touched = np.convolve(record.z_lost, memory)[_EDGE_GUARD:][:samples]
+    return np.asarray(touched > 0.5)
+
+
+def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
+    """The steps without those edges of which a part was lost."""
+    if record.z_lost is None:
+        return steps
+    lost = record.z_lost
+    whole = tuple(e for e in steps.edges if not np.any(lost[e.start : e.stop]))
+    return replace(steps, edges=whole)
 
 
 def content_frequency(motion: FloatArray, sample_period: float) -> float:

@@ -69,6 +69,20 @@ class ErrorSources:
         )
 
 
+def sources_with(calibration: Calibration, stated: Mapping[str, object]) -> ErrorSources:
+    """The sources the calibration tells of, those ``stated`` by name in their place.
+
+    Raises ConfigurationError for a name that is no source, or a value that is no uncertainty.
+    """
+    known = [field.name for field in fields(ErrorSources)]
+    for name, value in stated.items():
+        if name not in known:
+            raise ConfigurationError(f"uncertainty {name!r} is unknown, expected of {known}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigurationError(f"uncertainty {name} is {value!r}, expected a number in SI")
+    return replace(ErrorSources.of(calibration), **stated)  # type: ignore[arg-type]
+
+
 def _standard_uncertainty(certificate: Mapping[str, object], key: str) -> float:
     value = certificate.get(key, 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:

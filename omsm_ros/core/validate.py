@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, signal, stats
 
+from omsm_ros.core.confidence import autoregression
 from omsm_ros.core.output_error import Fit, Problem
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.spectrum import FrequencyResponse
@@ -57,6 +58,18 @@ def residual_tests(
         whiteness(fitted.residual),
         independence(fitted.residual, np.gradient(problem.motion)[problem.used]),
     )
+
+
+def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
+    """Power of the noise at low frequency over its mean where the axis rests; 1 for white."""
+    on_grid = problem.seen - problem.output(fitted)
+    rest = on_grid[problem.used & ~_active(steps, problem.period)]
+    if len(rest) < _LEAST_REST_SAMPLES:
+        return 1.0
+    rest = rest - np.mean(rest)
+    coefficients, variance = autoregression(rest)
+    power = float(np.mean(rest**2)) * float(np.sum(coefficients)) ** 2
+    return max(variance / power, 1.0) if power > 0 else 1.0
 
 
 def _active(steps: Steps, period: float) -> BoolArray:

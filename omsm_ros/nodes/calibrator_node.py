@@ -26,7 +26,7 @@ from omsm_ros.nodes.running import (
     run,
     settings_of,
 )
-from omsm_ros.offline import motion_of_bag
+from omsm_ros.studies import motion_of_bag
 
 
 class CalibratorNode(Node):
@@ -37,6 +37,9 @@ class CalibratorNode(Node):
         capacity = parameter(self, "buffer_samples", 3_600_000, "samples kept per topic")
         self._output = parameter(
             self, "output", "calibration.json", "where to write the calibration"
+        )
+        self._report_folder = parameter(
+            self, "report", "", "folder for the certificate of each identification; empty = none"
         )
         self._settings = settings_of(
             parameter(self, "settings", "{}", "JSON object of what the calibration belongs to")
@@ -76,11 +79,13 @@ class CalibratorNode(Node):
         self, request: Identify.Request, response: Identify.Response
     ) -> Identify.Response:
         try:
-            calibration = self._identify(request)
+            motion = self._motion(request)
+            calibration = self._identify(request, motion)
             response.calibration = conversions.calibration_message(
                 self._messages, calibration, self.get_clock().now().nanoseconds
             )
             response.success, self._last = self._judge(calibration)
+            self._last += self._certified(request, motion, calibration)
         except (OmsmError, OSError) as err:
             response.success, self._last = False, f"identification failed: {err}"
         if response.success:
@@ -99,9 +104,30 @@ class CalibratorNode(Node):
         save_calibration(self._output, calibration)
         return True, f"{verdict}; {calibration.id[:12]} written to {self._output}"
 
-    def _identify(self, request: Identify.Request) -> Calibration:
+    def _certified(
+        self, request: Identify.Request, motion: MotionRecord, calibration: Calibration
+    ) -> str:
+        """Write the certificate, if wanted, and say so; a full disk does not undo a calibration."""
+        if not self._report_folder:
+            return ""
+        # Drawing takes a second to import; most calibrators do without.
+        from omsm_ros.certification import write_certificate
+
+        try:
+            page = write_certificate(
+                Path(self._report_folder),
+                calibration,
+                motion,
+                input=request.input or "encoder",
+                source=Path(request.bag).name or "live recording",
+            )
+        except (OmsmError, OSError) as err:
+            return f"; no certificate: {err}"
+        return f"; certificate in {page}"
+
+    def _identify(self, request: Identify.Request, motion: MotionRecord) -> Calibration:
         return identify(
-            self._motion(request),
+            motion,
             order=request.order,
             input=request.input or "encoder",
             settings=self._settings,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,6 +20,7 @@ from omsm_ros.core.cloud import pack_points
 from omsm_ros.core.correct import CorrectionOptions, Corrector
 from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.load import LoadMeter
+from omsm_ros.core.uncertainty import ErrorSources, sources_with
 from omsm_ros.errors import OmsmError
 from omsm_ros.files import load_calibration
 from omsm_ros.nodes.running import (
@@ -37,7 +39,8 @@ from omsm_ros.offline import predict_from
 MessageInfo: TypeAlias = "dict[str, int]"
 
 FRAME, OVERRIDDEN_FRAME = "workpiece", "workpiece_overridden"
-GEOMETRY = ("centre_x", "centre_y", "probe_x", "probe_z", "beam_x", "beam_y", "abbe_arm")
+SOURCES = tuple(field.name for field in fields(ErrorSources))
+GEOMETRY = tuple(field.name for field in fields(Geometry))
 
 _COMPLAINT_PERIOD_S = 5.0
 
@@ -70,6 +73,12 @@ class CorrectorNode(Node):
                 }
             ),
         )
+        # What the certificate tells is used unless something else is stated here.
+        stated = {
+            name: parameter(self, f"sources.{name}", 0.0, "SI, k = 1; 0 = certificate")
+            for name in SOURCES
+        }
+        self._sources = {name: value for name, value in stated.items() if value}
         self._frame = FRAME
         self._messages = conversions.ros_messages()
         self._calibration: Calibration | None = None
@@ -112,7 +121,8 @@ class CorrectorNode(Node):
         for reason in reasons:
             self.get_logger().warning(f"overridden: {reason}")
         self._calibration = calibration
-        self._corrector = Corrector(calibration, self._options)
+        sources = sources_with(calibration, self._sources)
+        self._corrector = Corrector(calibration, replace(self._options, sources=sources))
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
 
     def _publish_rest(self) -> None:
@@ -213,6 +223,8 @@ class CorrectorNode(Node):
             return WARN, "no calibration: nothing is published", values
         values["calibration"] = self._calibration.id
         values |= self._load.report(time.process_time(), time.monotonic())
+        values["stamp_skew_s"] = self._corrector.stamp_skew
+        values |= {f"rms_{name}_m": value for name, value in self._corrector.budget.items()}
         for stream, account in self._corrector.account.as_dict().items():
             counted = account.pop("counted")
             values |= {f"{stream}_{name}": value for name, value in account.items()}

@@ -276,6 +276,17 @@ class TestImperfectData:
             turned.dynamics.denominator, identified().dynamics.denominator, rtol=1e-6
         )
 
+    def test_gaps_of_the_encoder_do_no_harm(self):
+        recording = recorded()
+        z = recording.axes.z.copy()
+        z[1000:1030] = np.nan
+        z[3000:3300] = np.nan
+        calibration = identify(record_of(recording, z=z))
+        assert str(calibration.certificate["verdict"]).startswith("accepted")
+        assert calibration.certificate["samples"]["missing_axis"] == 330
+        _, phase = errors(calibration, TRUTH, np.array([1.0]))
+        assert abs(np.degrees(phase[0])) < 2e-3
+
     def test_half_the_range_lost_still_identifies(self):
         recording = recorded()
         lost = np.abs(recording.distance.distance) > 30e-6

@@ -38,6 +38,15 @@ def test_lost_samples_are_not_used():
     assert np.sum(prepared.problem.used) > 10_000
 
 
+def test_after_a_gap_of_the_encoder_the_response_settles_first():
+    z = STEPS.copy()
+    z[1000:1030] = np.nan  # the second edge
+    prepared = prepare(MotionRecord.from_arrays(1e-3, z, -STEPS + 1e-9 * np.sin(TIME)), "encoder")
+    assert not np.any(prepared.problem.used[1000:1080])
+    assert prepared.problem.used[1090]
+    assert len(prepared.steps.edges) == 19
+
+
 def test_a_bent_drift_gets_its_columns_and_a_straight_one_does_not():
     straight = prepare(record_of(1e-7 * TIME / TIME[-1]), "encoder")
     bent = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")

@@ -1,0 +1,314 @@
+"""The numbers of a certificate as rows of text, with units and uncertainties.
+
+Certificates of older versions lack entries; a row that would have no number is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.calibration import SCHEMA, Calibration
+from omsm_ros.core.modes import known_modes
+from omsm_ros.report.measured import measured, number, plain, probability, raised
+from omsm_ros.report.tables import NOTHING, Table, count, mapping_table, part, quantity
+from omsm_ros.units import PPM
+
+# Where a p-value is called small.
+_SIGNIFICANT = 0.01
+# Coefficients are far more correlated than uncertain: to be of use they need their digits.
+_ALL_DIGITS = 10
+_SHOWN = {
+    "order", "structure", "singular_values", "singular_value_order", "candidates", "chi_square",
+    "residual_rms_m", "noise_m", "edges", "whiteness_p", "independence_p",
+    "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
+    "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
+    "shape", "modal_terms", "two_mass", "static_gains", "nonparametric_agreement", "samples",
+    "warnings", "reasons", "verdict",
+}  # fmt: skip
+
+Certificate = Mapping[str, Any]
+
+
+def listed(certificate: Certificate, name: str) -> list[Mapping[str, Any]]:
+    """The mappings in a list of the certificate; none if there is no such list."""
+    entries = certificate.get(name)
+    return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
+
+
+def numbers(certificate: Certificate, name: str) -> list[float]:
+    """The numbers in a list of the certificate."""
+    entries = certificate.get(name)
+    known = [number(entry) for entry in entries] if isinstance(entries, list) else []
+    return [value for value in known if value is not None]
+
+
+def texts(certificate: Certificate, name: str) -> list[str]:
+    """The texts of a list of the certificate."""
+    entries = certificate.get(name)
+    return [str(entry) for entry in entries] if isinstance(entries, list) else []
+
+
+def structure_text(structure: Mapping[str, Any]) -> str:
+    """``2 poles, 1 zero, no delay``."""
+    counts = [(structure.get("poles"), "pole"), (structure.get("zeros"), "zero")]
+    parts = [f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts if isinstance(n, int)]
+    if isinstance(structure.get("delay"), bool):
+        parts.append("delay" if structure["delay"] else "no delay")
+    return ", ".join(parts) or NOTHING
+
+
+def own_structure(calibration: Calibration) -> dict[str, object]:
+    """Structure of the coefficients themselves, whatever the certificate says of it."""
+    dynamics = calibration.dynamics
+    return {
+        "poles": len(dynamics.denominator) - 1,
+        "zeros": len(dynamics.numerator) - 1,
+        "delay": dynamics.delay > 0,
+    }
+
+
+def residual_table(certificate: Certificate) -> Table:
+    """Does the model leave anything that it should have explained?"""
+    white, free = (number(certificate.get(f"{n}_p")) for n in ("whiteness", "independence"))
+    rows = [
+        (
+            "χ² where the axis moves",
+            plain(certificate.get("chi_square")),
+            "1 if only noise is left",
+        ),
+        ("residual, rms", quantity(certificate.get("residual_rms_m"), "m"), "everywhere"),
+        ("noise of one reading", quantity(certificate.get("noise_m"), "m"), "where the axis rests"),
+        (
+            "whiteness, p",
+            probability(white),
+            _in_words(white, "white", "coloured; the uncertainties allow for it"),
+        ),
+        (
+            "independence of the motion, p",
+            probability(free),
+            _in_words(free, "does not follow the motion", "follows the motion: dynamics missing"),
+        ),
+        (
+            "χ² against the estimate without a model",
+            plain(certificate.get("nonparametric_agreement")),
+            "about 1 if the two agree",
+        ),
+        ("edges", count(certificate.get("edges")), ""),
+    ]
+    return Table("Tests of the residual", ("", "in words"), _known(rows, 1))
+
+
+def _in_words(p: float | None, good: str, bad: str) -> str:
+    return "" if p is None else bad if p < _SIGNIFICANT else good
+
+
+def order_table(certificate: Certificate) -> Table:
+    """Every structure that was tried."""
+    candidates = sorted(listed(certificate, "candidates"), key=structure_text)
+    scores = [number(c.get("bic")) for c in candidates]
+    least = min((s for s in scores if s is not None), default=0.0)
+    rows = [
+        (
+            structure_text(candidate),
+            NOTHING if score is None else f"{score - least:.1f}",
+            quantity(candidate.get("rms_m"), "m", 5),
+            quantity(candidate.get("held_out_m"), "m", 5),
+            _remark(candidate, score == least, certificate),
+        )
+        for candidate, score in zip(candidates, scores, strict=True)
+    ]
+    columns = ("BIC above lowest", "residual, rms", "on edges held out, rms", "")
+    return Table("Candidates", columns, rows)
+
+
+def _remark(candidate: Mapping[str, Any], lowest: bool, certificate: Certificate) -> str:
+    remarks = ["lowest BIC"] if lowest else []
+    if is_chosen(candidate, certificate):
+        remarks.append("✓ chosen")
+    return ", ".join(remarks)
+
+
+def is_chosen(candidate: Mapping[str, Any], certificate: Certificate) -> bool:
+    """True for the candidate whose structure the certificate gives as its own."""
+    structure = certificate.get("structure")
+    return isinstance(structure, Mapping) and all(
+        candidate.get(key) == structure.get(key) for key in ("poles", "zeros", "delay")
+    )
+
+
+def mode_table(calibration: Calibration) -> Table:
+    """The poles, and whether the band reaches them."""
+    rows = [
+        (
+            f"mode {index}" if mode.damping < 1 else f"real pole {index}",
+            measured(mode.frequency, mode.frequency_uncertainty, "Hz"),
+            measured(mode.damping, mode.damping_uncertainty)
+            if mode.damping < 1
+            else "1, by definition",
+            "yes" if mode.frequency <= calibration.valid_up_to else "no",
+        )
+        for index, mode in enumerate(known_modes(calibration), start=1)
+    ]
+    return Table("Modes", ("frequency", "damping ratio", "within the trusted band"), rows)
+
+
+def modal_table(certificate: Certificate) -> Table:
+    """Oscillating modes as the terms of Eq. 8."""
+    rows = [
+        (
+            f"term {index}",
+            quantity(term.get("frequency"), "Hz", 4),
+            plain(term.get("damping")),
+            plain(term.get("residue"), 4),
+        )
+        for index, term in enumerate(listed(certificate, "modal_terms"), start=1)
+    ]
+    return Table("Modal terms (Eq. 8)", ("frequency", "damping ratio", "residue [1/s²]"), rows)
+
+
+_MECHANICAL_UNITS = {"m1": "kg", "m2": "kg", "k1": "N/m", "k2": "N/m", "c1": "N·s/m", "c2": "N·s/m"}
+_FITTED = ("m2", "k1", "k2", "c1", "c2")
+
+
+def two_mass_table(certificate: Certificate) -> Table:
+    """Masses, springs and dampers, where a two-mass model was fitted."""
+    model: Mapping[str, Any] = part(certificate, "two_mass", "model") or {}
+    relative = part(certificate, "two_mass", "uncertainty")
+    spreads = dict(zip(_FITTED, relative, strict=False)) if isinstance(relative, list) else {}
+    rows = []
+    for name, unit in _MECHANICAL_UNITS.items():
+        value, spread = number(part(model, name)), number(spreads.get(name))
+        text = NOTHING if value is None else measured(value, (spread or 0.0) * value, unit)
+        rows.append((name, text))
+    misfit = plain(part(certificate, "two_mass", "misfit"))
+    rows.append(("misfit, over the stated uncertainty", misfit))
+    return Table("Two-mass model (Eq. 6, 7)", (), _known(rows, 1))
+
+
+_SHAPE_ROWS = (
+    ("gain off 1 by 1 %", "bandwidth_1_percent", None),
+    ("gain off 1 by 3 dB", "bandwidth_3db", None),
+    ("greatest gain", "resonance", "resonance_gain"),
+    ("least gain", "minimum", "minimum_gain"),
+)
+
+
+def shape_table(certificate: Certificate) -> Table:
+    """What stands out in the identified response."""
+    rows = [(name, _point(certificate, place, gain)) for name, place, gain in _SHAPE_ROWS]
+    return Table("Shape of the response", (), _known(rows, 1))
+
+
+def _point(certificate: Certificate, place: str, gain: str | None) -> str:
+    at = quantity(part(certificate, "shape", place), "Hz")
+    if gain is None or at == NOTHING:
+        return at
+    return f"{plain(part(certificate, 'shape', gain), 4)} at {at}"
+
+
+_GAINS = {
+    "probe_per_encoder": "probe per encoder, at rest",
+    "probe_per_reference": "probe per reference, at rest",
+    "reference_per_encoder": "reference per encoder, at rest",
+}
+
+
+def gain_table(calibration: Calibration) -> Table:
+    """Static gains: the probe's scale, or the encoder's? And how far each is from 1."""
+    certificate = calibration.certificate
+    spread = certificate.get("static_gain_uncertainty")
+    rows = [_gain_row("probe per encoder, fitted", calibration.static_gain, spread)]
+    for key, name in _GAINS.items():
+        gain = part(certificate, "static_gains", key) or {}
+        value, spread = part(gain, "value"), part(gain, "uncertainty")
+        rows.append(_gain_row(name, value, spread))
+    return Table("Static gain", ("travel per travel", "from 1 [ppm]"), _known(rows, 1))
+
+
+def _gain_row(name: str, value: object, uncertainty: object) -> tuple[str, ...]:
+    known, spread = number(value), number(uncertainty)
+    if known is None:
+        return (name, NOTHING, NOTHING)
+    off = measured((known - 1) / PPM, None if spread is None else spread / PPM)
+    return (name, measured(known, spread, digits=6), off)
+
+
+_POLARITIES = {1: "falls when Z rises", -1: "rises when Z rises"}
+
+
+def background_table(certificate: Certificate) -> Table:
+    """What the probe saw besides the motion."""
+    polarity = certificate.get("polarity")
+    rows = [
+        ("drift", quantity(certificate.get("drift_m_s"), "m/s")),
+        ("backlash", _or_none(certificate.get("backlash_m"), "m")),
+        (
+            "lag that motion between samples may hide, at most",
+            _or_none(certificate.get("inter_sample_delay_bound_s"), "s"),
+        ),
+        ("distance", _POLARITIES.get(polarity, NOTHING) if isinstance(polarity, int) else NOTHING),
+    ]
+    return Table("Besides the motion", (), _known(rows, 1))
+
+
+def _or_none(value: object, unit: str) -> str:
+    return "none seen" if number(value) == 0 else quantity(value, unit)
+
+
+def coefficient_table(calibration: Calibration) -> Table:
+    """G_m itself (Eq. 11), with standard uncertainties off the diagonal of the covariance."""
+    dynamics = calibration.dynamics
+    spread = np.sqrt(np.diag(calibration.covariance))
+    names = [_power("n", k) for k in range(len(dynamics.numerator))]
+    names += [_power("d", k) for k in range(1, len(dynamics.denominator))]
+    values = [*dynamics.numerator, *dynamics.denominator[1:]]
+    values.append(dynamics.delay)
+    rows = [
+        (name, plain(float(value), _ALL_DIGITS), plain(float(u), 2))
+        if u
+        else (name, f"{float(value):.{_ALL_DIGITS}g}", "fixed")
+        for name, value, u in zip([*names, "delay [s]"], values, spread, strict=True)
+    ]
+    columns = ("value", "standard uncertainty")
+    return Table("Coefficients of Eq. 11, ascending powers of s", columns, rows)
+
+
+def _power(letter: str, k: int) -> str:
+    unit = f"s{raised(k)}" if k > 1 else "s" if k else "1"
+    return f"{letter}{k} [{unit}]"
+
+
+def sample_account(certificate: Certificate) -> Table:
+    """What became of every sample."""
+    account = certificate.get("samples")
+    rows = [
+        (str(reason).replace("_", " "), count(value))
+        for reason, value in (account.items() if isinstance(account, Mapping) else ())
+    ]
+    return Table("Samples", (), rows)
+
+
+def identity_table(calibration: Calibration, source: str, version: str) -> Table:
+    """What the certificate is about."""
+    rows = [
+        ("identity", calibration.id),
+        ("schema", SCHEMA),
+        ("recording", source or NOTHING),
+        ("sample period", quantity(calibration.sample_period, "s", 4)),
+        ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
+        ("omsm_ros", version or NOTHING),
+    ]
+    return Table("Identity", (), _known(rows, 1))
+
+
+def further_table(certificate: Certificate) -> Table:
+    """Entries that have no other place on the page."""
+    rest = {str(key): value for key, value in certificate.items() if key not in _SHOWN}
+    return mapping_table("Further entries", rest)
+
+
+def _known(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
+    return [row for row in rows if row[column] != NOTHING]

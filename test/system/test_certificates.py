@@ -1,0 +1,45 @@
+"""The calibrator files a certificate of every identification, accepted or rejected."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
+
+from omsm_msgs.srv import Identify
+
+from omsm_ros import bags
+from omsm_ros.twin.cell import blocks_of
+from omsm_ros.twin.scenario import Scenario, step_test_of
+
+
+def _bag(path, rise):
+    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+        for axes, distance in blocks_of(step_test_of(Scenario(step_rise=rise))):
+            writer.write_axes(axes)
+            writer.write_distance(distance)
+    return str(path)
+
+
+def test_a_certificate_is_filed_of_every_identification(cell):
+    folder, output = cell.folder / "certificates", cell.folder / "cal.json"
+    cell.processes.start("calibrator", output=str(output), report=str(folder))
+    page = folder / "certificate.html"
+    for rise, success, word in ((0.0, False, "✕ Rejected"), (20e-3, True, "✓ Accepted")):
+        bag = _bag(cell.folder / f"rise_{rise}.mcap", rise)
+        reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2)
+        assert reply.success == success, reply.message
+        assert str(page) in reply.message
+        assert word in page.read_text(encoding="utf-8")
+        assert output.exists() == success
+
+
+def test_a_certificate_that_cannot_be_written_does_not_undo_the_calibration(cell):
+    (cell.folder / "taken").write_text("")
+    output = cell.folder / "cal.json"
+    cell.processes.start("calibrator", output=str(output), report=str(cell.folder / "taken"))
+    bag = _bag(cell.folder / "steps.mcap", 20e-3)
+    reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2)
+    assert reply.success
+    assert "no certificate" in reply.message
+    assert output.exists()
