@@ -46,7 +46,9 @@ def main() -> int:
             show(row)
         print(f"      {part}: {time.monotonic() - begin:.0f} s", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    # JSON has no NaN: what could not be had is null.
+    plain = [{k: None if v != v else v for k, v in row.items()} for row in found]
+    args.out.write_text(json.dumps(plain, indent=1) + "\n")
     failed = [row["name"] for row in found if row["holds"] is False]
     print(f"{len(found)} figures in {args.out}, {len(failed)} bars not cleared")
     return 1 if failed else 0

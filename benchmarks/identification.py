@@ -27,7 +27,9 @@ from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 FREQUENCIES = np.array([1.0, 5.0, 15.0, 50.0])
 # Not the seeds on which the choice of structure was designed.
-FIRST_SEED = 6000
+FIRST_SEED = 5000
+# The charge for parameters under coloured noise was designed on those; its study has its own.
+FIRST_COLOURED_SEED = 6000
 _STAND_OFF = -49e-6
 _DEFAULT = StepTest()
 
@@ -91,7 +93,7 @@ def _rms(values: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
-def accuracy(runs: int = 100) -> list[Row]:
+def accuracy(runs: int = 200) -> list[Row]:
     """Errors over the stated ones, which for white noise are the Cramér-Rao bound."""
     found = monte_carlo(
         range(FIRST_SEED, FIRST_SEED + runs), lambda s: record_once(s), Plant().dynamics
@@ -143,7 +145,7 @@ def coloured(runs: int = 40) -> list[Row]:
         distance[rng.random(n) < 0.05] = np.nan
         return MotionRecord.from_arrays(clean.sample_period, clean.z, distance)
 
-    seeds = range(FIRST_SEED, FIRST_SEED + runs)
+    seeds = range(FIRST_COLOURED_SEED, FIRST_COLOURED_SEED + runs)
     covered = monte_carlo(seeds, spoiled, Plant().dynamics).covered()
     return [
         at_least(f"coverage of {what} at {f:g} Hz, coloured", covered[i, k], "%", 90)

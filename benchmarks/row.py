@@ -48,3 +48,8 @@ def between(
     value = float(value)
     bar, holds = f"{low:g} to {high:g}", low <= value <= high
     return Row(name=name, value=value, unit=unit, peer=peer, bar=bar, holds=holds)
+
+
+def not_compared(name: str, unit: str, bar: str, why: str) -> Row:
+    """A figure that could not be had here."""
+    return Row(name=name, value=float("nan"), unit=unit, peer=why, bar=bar, holds=None)
