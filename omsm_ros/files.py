@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.calibration import SCHEMA, Calibration, content_id
 from omsm_ros.core.cloud import CLOUD_FIELDS, pack_points
 from omsm_ros.core.kinematics import Geometry
-from omsm_ros.core.records import SurfacePoints
+from omsm_ros.core.records import FloatArray, SurfacePoints
 from omsm_ros.core.surface import Surface, surface_from_description
 from omsm_ros.errors import CalibrationError, ConfigurationError, FileError, SurfaceError
 
@@ -27,6 +27,7 @@ CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 """The files of a measurement."""
 
 MAX_CALIBRATION_BYTES = 4_000_000
+MAX_MOTION_BYTES = 200_000_000
 MAX_YAML_BYTES = 100_000
 
 _COEFFICIENTS = {"type": "array", "items": {"type": "number"}, "minItems": 1, "maxItems": 64}
@@ -239,6 +240,31 @@ def _read_mapping(path: Path | str, what: str, error: type[FileError]) -> dict[s
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise error(f"{str(path)!r} holds {content!r:.80}, expected names and values of a {what}")
     return content
+
+
+def load_motion(path: Path | str) -> tuple[FloatArray, float]:
+    """Read a planned motion, CSV ``time_s,z_m`` as 'omsm plan' writes it: z [m] and its period [s].
+
+    Raises FileError for anything but two columns of numbers at even times.
+    """
+    path = Path(path)
+    text = _read_text(path, MAX_MOTION_BYTES, FileError, "motion")
+    try:
+        table = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, ndmin=2)
+    except ValueError as err:
+        raise FileError(f"{str(path)!r} is not a table of time_s,z_m: {err}") from err
+    if table.shape[0] < 2 or table.shape[1] != 2 or not np.all(np.isfinite(table)):
+        raise FileError(
+            f"{str(path)!r} holds {table.shape!r} values, expected two columns time_s,z_m"
+        )
+    steps = np.diff(table[:, 0])
+    period = float(np.mean(steps))
+    if not period > 0 or np.ptp(steps) > 0.01 * period:
+        raise FileError(
+            f"{str(path)!r}: time runs in steps of {steps.min()!r} to {steps.max()!r} s, "
+            "expected even steps"
+        )
+    return np.asarray(table[:, 1], np.float64), period
 
 
 def save_text(path: Path | str, text: str) -> None:

@@ -98,6 +98,31 @@ def test_predict_says_what_the_scan_will_cost(capsys, small_scan, scan_bag, cali
     assert found["outside_band_fraction"] < 0.02
 
 
+def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
+    assert cli.main(["plan", "steps", "--out", str(tmp_path), "--json"]) == 0
+    capsys.readouterr()
+    found = facts(capsys, "predict", tmp_path / "steps.csv", "--calibration", calibration)
+    # The lag of 0.34 ms times the greatest speed of an edge, 9.8 µm with a mean of 0.49 mm/s.
+    assert found["peak_to_valley"] == pytest.approx(2 * 0.3397e-3 * 2 * 9.8e-6 / 20e-3, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("time_s,z_m\n0,1e-6\n", "two columns"),
+        ("time_s,z_m\n0,a\n1,b\n", "not a table"),
+        ("time_s,z_m\n0,1\n1,nan\n", "two columns"),
+        ("time_s,z_m\n0,1\n1,1\n5,1\n", "even steps"),
+        ("time_s,z_m\n2,1\n1,1\n", "even steps"),
+    ],
+)
+def test_a_wrong_motion_file_is_refused(tmp_path, text, named):
+    path = tmp_path / "motion.csv"
+    path.write_text(text)
+    with pytest.raises(files.FileError, match=named):
+        files.load_motion(path)
+
+
 def test_reversal_finds_no_latency_in_a_mechanical_lag(capsys, tmp_path, calibration):
     scans = [
         write(

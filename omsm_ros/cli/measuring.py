@@ -12,7 +12,7 @@ from omsm_ros.core.correct import CorrectionOptions
 from omsm_ros.core.kinematics import Geometry
 from omsm_ros.core.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.uncertainty import sources_with
-from omsm_ros.files import load_calibration, load_geometry, load_surface
+from omsm_ros.files import load_calibration, load_geometry, load_motion, load_surface
 from omsm_ros.measurement import Admission, measure
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
@@ -111,7 +111,7 @@ def _show_correct(summary: Facts) -> None:
 
 
 def _declare_predict(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path, help="a recorded motion")
+    sub.add_argument("motion", type=Path, help="a bag, or a planned motion as CSV time_s,z_m")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument(
         "--budget", type=positive, default=DEFAULT_BUDGET_M, help="allowed residual, k = 2 [m]"
@@ -120,8 +120,11 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
 
 def _predict(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    with progress_bar("reading", args.json) as progress:
-        z, period = offline.motion_in(args.bag, progress)
+    if args.motion.suffix == ".csv":
+        z, period = load_motion(args.motion)
+    else:
+        with progress_bar("reading", args.json) as progress:
+            z, period = offline.motion_in(args.motion, progress)
     return asdict(predict_error(calibration, z, period, args.budget))
 
 

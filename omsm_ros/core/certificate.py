@@ -13,6 +13,8 @@ from omsm_ros.core.transfer_function import TransferFunction
 
 # A residual this much larger than the noise is not noise; its square is χ² per sample.
 _WORST_CHI_SQUARE = 1.3
+# A rest this much noisier than the motion is no measure of noise: something still rings.
+_LEAST_CHI_SQUARE = 0.3
 _LEAST_TRUSTED_HZ = 5.0
 # 3 mdeg at 15 Hz, below anything a scan would notice.
 _HARMLESS_DELAY_S = 0.5e-6
@@ -96,6 +98,12 @@ def _reasons(evidence: Evidence) -> list[str]:
             f"where the axis moves the residual is {evidence.chi_square:.2f} times the noise of "
             f"{evidence.noise * 1e9:.3g} nm squared: the model misses something; check for "
             "backlash, a loose mount or a clipped probe"
+        )
+    if evidence.chi_square < _LEAST_CHI_SQUARE:
+        reasons.append(
+            f"where the axis moves the residual is only {evidence.chi_square:.2g} times the noise "
+            f"of {evidence.noise * 1e9:.3g} nm squared: the probe is not quiet where the axis "
+            "rests, or the stated noise is too large; start the recording after a second of rest"
         )
     if evidence.valid_up_to < _LEAST_TRUSTED_HZ:
         reasons.append(

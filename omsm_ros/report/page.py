@@ -158,7 +158,12 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
 
 def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
-    found = [tables.error_table(summary), tables.sample_table(summary)]
+    found = [
+        tables.error_table(summary),
+        tables.budget_table(summary),
+        tables.motion_table(summary),
+        tables.sample_table(summary),
+    ]
     if report.calibration is not None:
         found.append(tables.calibration_table(report.calibration))
         found.append(tables.remarks_table(report.calibration))

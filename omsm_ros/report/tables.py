@@ -77,6 +77,35 @@ def error_table(summary: Mapping[str, object]) -> Table:
     return Table("Errors", ("uncorrected", "corrected"), known)
 
 
+def budget_table(summary: Mapping[str, object]) -> Table:
+    """What the uncertainty of a height is made of, the largest part first."""
+    budget: Mapping[str, Any] = part(summary, "uncertainty_budget") or {}
+    known = {name: value for name, value in budget.items() if value}
+    ordered = sorted(known, key=lambda name: -known[name])
+    rows = [(name.replace("_", " "), quantity(known[name], "m")) for name in ordered]
+    return Table("Uncertainty of a height, k = 1, rms over the scan", (), rows)
+
+
+def motion_table(summary: Mapping[str, object]) -> Table:
+    """Was the scan slow enough, and was H good enough for it?"""
+    prediction: Mapping[str, Any] = part(summary, "prediction") or {}
+    outside = prediction.get("outside_band_fraction")
+    factor = prediction.get("speed_factor")
+    rows = [
+        ("left by the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
+        (
+            "motion beyond the trusted band",
+            NOTHING if outside is None else f"{100 * outside:.2g} %",
+        ),
+        ("could have run faster by", NOTHING if factor is None else f"{factor:.3g} ×"),
+        (
+            "discretisation, peak to valley",
+            quantity(part(summary, "discretisation", "peak_to_valley"), "m"),
+        ),
+    ]
+    return Table("The motion", (), [row for row in rows if row[1] != NOTHING])
+
+
 def sample_table(summary: Mapping[str, object]) -> Table:
     """Where every sample of every stream went."""
     streams: Mapping[str, Any] = part(summary, "samples") or {}

@@ -46,6 +46,7 @@ def test_good_evidence_is_accepted_as_far_as_it_goes():
     ("changed", "reason"),
     [
         ({"chi_square": 2.0}, "misses something"),
+        ({"chi_square": 0.1}, "not quiet"),
         ({"valid_up_to": 1.0}, "more or larger steps"),
         ({"inter_sample_delay_bound": 5e-6}, "between samples"),
     ],

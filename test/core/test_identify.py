@@ -287,6 +287,13 @@ class TestImperfectData:
         _, phase = errors(calibration, TRUTH, np.array([1.0]))
         assert abs(np.degrees(phase[0])) < 2e-3
 
+    @pytest.mark.parametrize("start", [510, 530])
+    def test_a_record_that_starts_while_a_light_mode_rings_is_not_trusted(self, start):
+        recording = recorded(plant=Plant(resonance(60.0, 0.02)))
+        seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
+        late = MotionRecord.from_arrays(1e-3, recording.axes.z[start:], seen[start:])
+        assert identify(late).certificate["verdict"] == "rejected"
+
     def test_half_the_range_lost_still_identifies(self):
         recording = recorded()
         lost = np.abs(recording.distance.distance) > 30e-6

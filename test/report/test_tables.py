@@ -136,3 +136,23 @@ def test_a_mapping_keeps_its_names_and_writes_its_values_as_json():
         "Settings", {"probe_rate": 1000, "on": True, "name": "B", "x": [1]}
     )
     assert table.rows == [("probe_rate", "1000"), ("on", "true"), ("name", "B"), ("x", "[1]")]
+
+
+class TestBudgetAndMotion:
+    def test_the_largest_part_comes_first_and_nothing_is_left_out_but_zero(self):
+        budget = {"encoder_noise": 1e-9, "probe_noise": 1e-8, "abbe": 0.0}
+        rows = tables.budget_table({"uncertainty_budget": budget}).rows
+        assert [row[0] for row in rows] == ["probe noise", "encoder noise"]
+        assert plain(rows[0][1]) == "10.0 nm"
+        assert tables.budget_table({}).rows == []
+
+    def test_motion_says_how_much_faster(self):
+        summary = {
+            "prediction": {"residual": 2e-9, "outside_band_fraction": 0.0012, "speed_factor": 3.25},
+            "discretisation": {"peak_to_valley": 5e-14},
+        }
+        rows = dict(tables.motion_table(summary).rows)
+        assert plain(rows["left by the uncertain dynamics, k = 1"]) == "2.00 nm"
+        assert rows["motion beyond the trusted band"] == "0.12 %"
+        assert rows["could have run faster by"] == "3.25 ×"
+        assert tables.motion_table({}).rows == []
