@@ -6,8 +6,11 @@ SOURCES := $(if $(shell bootstrap/distribution.sh),distribution,wheels)
 VENV := .venv/.from-$(SOURCES)
 MESSAGES := install/.omsm_msgs
 PACKAGE := install/.omsm_ros
+PEERS := .venv/.peers
 RUN := . ./env.sh &&
 
+# The matrices here are small: threads of BLAS would only get into each other's way.
+export OMP_NUM_THREADS ?= 1
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
@@ -26,7 +29,7 @@ lint: setup
 	$(RUN) ruff format --check .
 	$(RUN) mypy
 
-bench: setup
+bench: $(PEERS)
 	$(RUN) python -m benchmarks
 
 soak: setup
@@ -51,6 +54,10 @@ endif
 
 $(VENV): $(addprefix bootstrap/,install.sh repair_wheels.py lock.txt runtime.in develop.in colcon.in)
 	@bootstrap/install.sh
+	@touch $@
+
+$(PEERS): bootstrap/peers.txt $(PACKAGE)
+	.venv/bin/python -m pip install --quiet --constraint bootstrap/lock.txt --requirement $<
 	@touch $@
 
 $(MESSAGES): $(VENV) bootstrap/build.sh colcon_defaults.yaml $(shell find msg_defs -type f)

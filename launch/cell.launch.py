@@ -1,6 +1,6 @@
 """Driver, calibrator and corrector of a real cell (needs the full ROS 2 distribution).
 
-    ros2 launch omsm_ros cell.launch.py config:=/path/to/folder
+ros2 launch omsm_ros cell.launch.py config:=/path/to/folder
 """
 
 from pathlib import Path

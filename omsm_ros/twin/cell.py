@@ -106,9 +106,7 @@ def record(
     )
     true_distance = truth + cell.drift * time - moved.probe - stand_off
     distance = _reading(cell.probe, true_distance, cell.sample_period, probe_random)
-    return Recording(
-        axes=axes, distance=distance, probe_motion=moved.probe, surface_height=truth
-    )
+    return Recording(axes=axes, distance=distance, probe_motion=moved.probe, surface_height=truth)
 
 
 def _late(plant: Plant, latency: float) -> Plant:

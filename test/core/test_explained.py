@@ -62,9 +62,7 @@ def test_modelled_agrees_with_a_recursive_filter(explained, calibration):
 def test_a_wrong_model_shows_at_the_edges_far_below_the_noise(record, calibration, explained):
     """10 µs of lag on 0.9 mm/s are 9 nm, less than the noise of one reading."""
     late = replace(calibration, dynamics=_delayed(calibration.dynamics, 10e-6), **_uncertain(2))
-    right, wrong = (
-        mean_at_edges(e, 30e-3, 60e-3) for e in (explained, explain(record, late))
-    )
+    right, wrong = (mean_at_edges(e, 30e-3, 60e-3) for e in (explained, explain(record, late)))
     assert right.edges == wrong.edges == 20
     at_edge = np.abs(right.time) < 5e-3
     speed = np.max(np.abs(np.diff(explained.carriage))) / explained.sample_period

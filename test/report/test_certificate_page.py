@@ -196,9 +196,10 @@ class TestOlderCertificates:
             covariance=np.zeros((2, 2)),
         )
         figures = certificate_figures_of(still)
-        assert "0 poles, 0 zeros, delay" in Page(
-            render(Certificate(still, "today", figures=figures))
-        ).text
+        assert (
+            "0 poles, 0 zeros, delay"
+            in Page(render(Certificate(still, "today", figures=figures))).text
+        )
 
 
 class TestVerdict:
