@@ -21,7 +21,7 @@ from omsm_ros.core.recursion import Recursion, past_motion
 from omsm_ros.core.surface import PAPER_MIRROR
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import CLOUD, REPORT, SUMMARY, load_calibration, open_ply, save_json
+from omsm_ros.files import CLOUD, REPORT, SUMMARY, CloudFile, load_calibration, save_json
 from omsm_ros.report import response_figures, style
 from omsm_ros.report.cloud_view import CloudView
 from omsm_ros.report.figures import overview_figure
@@ -121,12 +121,13 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
     done = offline.correct_bag(plan.bag, calibration, plan.out / CLOUD)
-    cloud = open_ply(plan.out / CLOUD)
+    stored = CloudFile(plan.out / CLOUD)
+    cloud = stored.read()
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
-    summary = measurement.summarise(plan.bag, done, cloud, calibration, PAPER_MIRROR)
+    summary = measurement.summarise(plan.bag, done, stored, calibration, PAPER_MIRROR)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before

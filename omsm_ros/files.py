@@ -177,25 +177,35 @@ class PlyWriter:
         self._file.__exit__(kind, error, trace)
 
 
-def open_ply(path: Path | str) -> NDArray[np.void]:
-    """Points of our own ``cloud.ply``: a structured array (n,), read from disk as it is used.
+class CloudFile:
+    """Our own ``cloud.ply``, read in portions: memory does not depend on its length.
 
-    Raises FileError if it is no cloud of ours, or was cut short.
+    points: how many it holds. Raises FileError if it is no cloud of ours, or was cut short.
     """
-    path = Path(path)
-    with path.open("rb") as stream:
-        head, mark, _ = stream.read(_PLY_HEADER_BYTES).partition(b"end_header\n")
-    if not head.startswith(b"ply\n") or not mark:
-        raise FileError(f"{str(path)!r} is not a PLY file of ours")
-    count = next(
-        (int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element vertex")),
-        -1,
-    )
-    if path.stat().st_size != _PLY_HEADER_BYTES + count * _PLY_DTYPE.itemsize:
-        raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
-    if not count:
-        return np.empty(0, _PLY_DTYPE)
-    return np.memmap(path, _PLY_DTYPE, mode="r", offset=_PLY_HEADER_BYTES)
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
+        with self._path.open("rb") as stream:
+            head, mark, _ = stream.read(_PLY_HEADER_BYTES).partition(b"end_header\n")
+        if not head.startswith(b"ply\n") or not mark:
+            raise FileError(f"{str(path)!r} is not a PLY file of ours")
+        vertices = [line for line in head.splitlines() if line.startswith(b"element vertex")]
+        self.points = int(vertices[0].split()[2]) if vertices else -1
+        if self._path.stat().st_size != _PLY_HEADER_BYTES + self.points * _PLY_DTYPE.itemsize:
+            raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
+
+    def portions(self, size: int = 500_000) -> Iterator[NDArray[np.void]]:
+        """Yield all points in order, ``size`` at a time, as structured arrays of the contract."""
+        with self._path.open("rb") as stream:
+            stream.seek(_PLY_HEADER_BYTES)
+            while raw := stream.read(size * _PLY_DTYPE.itemsize):
+                yield np.frombuffer(raw, _PLY_DTYPE)
+
+    def read(self, most: int | None = None) -> NDArray[np.void]:
+        """All points, or evenly every k-th so that there are no more than ``most``."""
+        every = 1 if most is None else max(-(-self.points // most), 1)
+        parts = [part[::every].copy() for part in self.portions(every * 100_000)]
+        return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])
 
 
 # ----------------------------------------------------------- surface, geometry, summary

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omsm_ros import __version__, offline
 from omsm_ros.core import form
@@ -22,11 +21,10 @@ from omsm_ros.core.discretise import discretise
 from omsm_ros.core.predict import predict_error
 from omsm_ros.core.surface import Surface
 from omsm_ros.errors import DataError
-from omsm_ros.files import CLOUD, REPORT, SUMMARY, open_ply, save_json
+from omsm_ros.files import CLOUD, REPORT, SUMMARY, CloudFile, save_json
 
 # Bound the memory whatever the length of a scan.
 _MOST_SORTED = 1_000_000
-_PORTION = 500_000
 _MOST_JUDGED = 2_000_000
 
 
@@ -78,7 +76,7 @@ def measure(
         comment=comment,
         progress=progress,
     )
-    cloud = open_ply(out / CLOUD)
+    cloud = CloudFile(out / CLOUD)
     summary = summarise(bag, done, cloud, calibration, nominal)
     summary["admission"] = admitted
     summary["warnings"] += [f"overridden: {reason}" for reason in reasons]
@@ -87,9 +85,9 @@ def measure(
     save_json(out / SUMMARY, summary)
     if report:
         # Here, because drawing takes longer to load than a scan to correct.
-        from omsm_ros.publication import figures_of, publish
+        from omsm_ros.publication import MOST_DRAWN, figures_of, publish
 
-        figures = figures_of(cloud, calibration, nominal, period)
+        figures = figures_of(cloud.read(MOST_DRAWN), calibration, nominal, period)
         publish(out, f"Surface of {bag.name}", summary, calibration, figures)
     return summary
 
@@ -97,7 +95,7 @@ def measure(
 def summarise(
     bag: Path,
     done: offline.Correction,
-    cloud: NDArray[np.void],
+    cloud: CloudFile,
     calibration: Calibration,
     nominal: Surface | None,
 ) -> dict[str, Any]:
@@ -117,7 +115,7 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY},
     }
-    if not len(cloud):
+    if not cloud.points:
         return summary | {"warnings": ["not one sample could be corrected; see the reasons"]}
     return summary | _motion_judged(bag, calibration) | _figures_of_merit(cloud, nominal)
 
@@ -140,11 +138,10 @@ def _motion_judged(bag: Path, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _figures_of_merit(cloud: NDArray[np.void], nominal: Surface | None) -> dict[str, Any]:
+def _figures_of_merit(cloud: CloudFile, nominal: Surface | None) -> dict[str, Any]:
     running = {name: form.RunningStatistics() for name in ("error", "raw", "corrected")}
     largest = 0.0
-    for start in range(0, len(cloud), _PORTION):
-        part = cloud[start : start + _PORTION]
+    for part in cloud.portions():
         x, y, height, error = (
             part[name].astype(np.float64) for name in ("x", "y", "height", "dynamic_error")
         )
@@ -154,18 +151,15 @@ def _figures_of_merit(cloud: NDArray[np.void], nominal: Surface | None) -> dict[
             deviation = form.deviation(x, y, height, nominal)
             running["corrected"].add(x, y, deviation)
             running["raw"].add(x, y, deviation + error)
+    median = float(np.median(cloud.read(_MOST_SORTED)["uncertainty"]))
     removed = running["error"].statistics()
     spread = {"peak_to_valley": removed.peak_to_valley, "rms": removed.rms_area_weighted}
     found: dict[str, Any] = {
         "dynamic_error_before": spread,
-        "uncertainty": {"median": _median(cloud["uncertainty"]), "largest": largest},
+        "uncertainty": {"median": median, "largest": largest},
     }
     if nominal is not None:
         found["deviation"] = {
             name: asdict(running[name].statistics()) for name in ("raw", "corrected")
         }
     return found
-
-
-def _median(values: NDArray[np.float32]) -> float:
-    return float(np.median(values[:: -(-len(values) // _MOST_SORTED)]))

@@ -19,7 +19,8 @@ from omsm_ros.report.gallery import surface_figures
 from omsm_ros.report.page import Report, render
 from omsm_ros.report.response_figures import bode
 
-_MOST_DRAWN = 1_000_000
+MOST_DRAWN = 1_000_000
+"""Points a figure is drawn from: no picture has so many pixels, and all numbers come from all."""
 
 
 def figures_of(
@@ -37,13 +38,10 @@ def figures_of(
 def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
     """Columns of a cloud for the figures; None if it has no points.
 
-    A cloud of more than a million points is thinned evenly: no picture has so many pixels,
-    and all numbers come from all points. Without the dynamic correction its height would be
-    ``raw_height``.
+    Without the dynamic correction its height would be ``raw_height``.
     """
     if not len(cloud):
         return None
-    cloud = cloud[:: -(-len(cloud) // _MOST_DRAWN)]
     sample = cloud["sample"].astype(np.int64)
     error = cloud["dynamic_error"].astype(np.float64)
     return CloudView(

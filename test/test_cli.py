@@ -57,7 +57,7 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     for account in summary["samples"].values():
         assert account["received"] == 40_000
         assert account["corrected"] + sum(account["counted"].values()) == 40_000
-    cloud = files.open_ply(tmp_path / "cloud.ply")
+    cloud = files.CloudFile(tmp_path / "cloud.ply").read()
     assert len(cloud) == summary["samples"]["distance"]["corrected"]
     # The figure error of the twin's mirror is a few nanometres here, the probe's noise 10 nm.
     assert summary["deviation"]["corrected"]["rms"] < 15e-9

@@ -144,7 +144,7 @@ def test_cloud_is_the_same_however_it_was_written(tmp_path):
         for start in range(0, 1000, 125):
             ply.write(_points(125, start))
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
-    cloud = files.open_ply(tmp_path / "one.ply")
+    cloud = files.CloudFile(tmp_path / "one.ply").read()
     np.testing.assert_array_equal(cloud["height"], _points(1000).height)
     np.testing.assert_array_equal(cloud["z"], _points(1000).height.astype(np.float32))
     np.testing.assert_array_equal(cloud["sample"], np.arange(1000))
@@ -176,10 +176,10 @@ def test_a_cut_or_foreign_cloud_is_refused(tmp_path):
         ply.write(_points(3))
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(FileError, match="cut short"):
-        files.open_ply(path)
+        files.CloudFile(path)
     path.write_text("solid cube")
     with pytest.raises(FileError, match="PLY"):
-        files.open_ply(path)
+        files.CloudFile(path)
 
 
 def test_surface_file(tmp_path):
@@ -202,3 +202,21 @@ def test_summary_refuses_what_json_cannot_say(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         files.save_json(tmp_path / "s.json", {"rms": float("nan")})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_cloud_is_read_in_portions_and_thinned_evenly(tmp_path):
+    with files.PlyWriter(tmp_path / "c.ply") as ply:
+        ply.write(_points(1000))
+    cloud = files.CloudFile(tmp_path / "c.ply")
+    assert cloud.points == 1000
+    assert [len(part) for part in cloud.portions(300)] == [300, 300, 300, 100]
+    joined = np.concatenate(list(cloud.portions(300)))
+    assert joined.tobytes() == cloud.read().tobytes()  # bytes, because intensity may be NaN
+    np.testing.assert_array_equal(cloud.read(most=400)["sample"], np.arange(0, 1000, 3))
+
+
+def test_an_empty_cloud_is_a_cloud(tmp_path):
+    with files.PlyWriter(tmp_path / "c.ply"):
+        pass
+    assert files.CloudFile(tmp_path / "c.ply").points == 0
+    assert len(files.CloudFile(tmp_path / "c.ply").read(most=10)) == 0

@@ -23,6 +23,7 @@ from omsm_ros.core.confidence import (
     response_band,
     trusted_up_to,
 )
+from omsm_ros.core.grey_box import table_mass, two_mass_entry
 from omsm_ros.core.hankel import HankelVote, hankel_vote
 from omsm_ros.core.inter_sample import inter_sample_delay_bound
 from omsm_ros.core.motion_record import MotionRecord
@@ -67,24 +68,29 @@ def identify(
     noise: known standard deviation of one reading of the probe [m], for χ²; None to take
         it where the axis rests
     limits: of the 95 % band, deciding ``valid_up_to``
+    settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the
+        certificate has the masses and springs of a response that is that of two masses
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
-    did not see it. A model that can be had but not trusted is returned with the verdict
+    did not see it, ConfigurationError for an option or a mass that can't be. A model that can be had but not trusted is returned with the verdict
     "rejected" in its certificate.
     """
+    mass = table_mass(settings or {})
     prepared = prepare(record, input)
     model = choose_model(prepared, order)
     check_gain(model.chosen.fit.gain)
     known = _Known.of(prepared, model, limits)
+    dynamics, covariance = model.chosen.fit.dynamics, known.covariance
     certificate = certify(
-        model.chosen.fit.dynamics,
+        dynamics,
         model.chosen,
         model.candidates,
         model.vote,
-        _evidence(prepared, model, known, noise),
-        _further(record, prepared, model, known),
+        _evidence(prepared, model, known, noise, limits),
+        {"input": input}
+        | _further(record, prepared, model, known)
+        | {"two_mass": two_mass_entry(dynamics, covariance, known.valid_up_to, mass)},
     )
-    dynamics, covariance = model.chosen.fit.dynamics, known.covariance
     static_gain = abs(model.chosen.fit.gain)
     if free_dc_gain:
         dynamics, covariance = _with_dc_gain(dynamics, covariance, static_gain, known.gain_variance)
@@ -165,7 +171,13 @@ def _delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> fl
     return float(low.phase[0] / (2 * np.pi * _LOW_FREQUENCY_HZ))
 
 
-def _evidence(prepared: Prepared, model: Model, known: _Known, noise: float | None) -> Evidence:
+def _evidence(
+    prepared: Prepared,
+    model: Model,
+    known: _Known,
+    noise: float | None,
+    limits: ResponseLimits,
+) -> Evidence:
     best, problem = model.chosen.fit, prepared.problem
     tests = residual_tests(problem, best, prepared.steps, noise)
     return Evidence(
@@ -175,6 +187,7 @@ def _evidence(prepared: Prepared, model: Model, known: _Known, noise: float | No
         whiteness=tests.whiteness,
         independence=tests.independence,
         valid_up_to=known.valid_up_to,
+        limits=limits,
         nyquist=0.5 / problem.period,
         delay_noise=_delay_uncertainty(best.dynamics, known.from_noise),
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),

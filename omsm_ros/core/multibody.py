@@ -23,6 +23,10 @@ from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import DataError, IdentificationError
 
 _LINES = 200
+# Natural logarithm of how far from its guess a mass or a spring may come out.
+_SEARCHED = 8.0
+# The six guesses race for this many steps; the best of them is followed to its end.
+_RACE_EVALUATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -157,13 +161,14 @@ def fit_two_mass(
         turned = np.angle(np.exp(1j * difference.imag))
         return np.asarray(whiten * np.concatenate([difference.real, turned]))
 
-    best = min(
-        (
-            optimize.least_squares(residual, start, x_scale="jac")
-            for start in _starts(terms, table_mass)
-        ),
-        key=lambda solution: float(solution.cost),
-    )
+    def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
+        box = (start - _SEARCHED, start + _SEARCHED)
+        return optimize.least_squares(
+            residual, start, x_scale="jac", bounds=box, max_nfev=evaluations
+        )
+
+    raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(terms, table_mass)]
+    best = descend(min(raced, key=lambda found: float(found.cost)).x, None)
     sensitivity = np.linalg.pinv(best.jac) * whiten
     spread = sensitivity @ _stacked_jacobian(dynamics, lines)
     variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
