@@ -54,12 +54,11 @@ def test_calibrate_scan_correct_and_replay(cell):
     assert page.count("data:image/png;base64,") >= 8
 
 
-@pytest.fixture
-def correcting(cell, true_calibration):
-    """Emulator, driver and corrector, with the true calibration."""
+def start_correcting(cell, calibration, **emulator):
+    """Emulator, driver and corrector, all connected."""
     path = cell.folder / "cal.json"
-    save_calibration(path, true_calibration)
-    cell.start_emulator()
+    save_calibration(path, calibration)
+    cell.start_emulator(**emulator)
     cell.processes.start("confocal_driver", port=cell.link)
     cell.processes.start("corrector", calibration=str(path))
     cell.wait(
@@ -67,9 +66,9 @@ def correcting(cell, true_calibration):
         lambda: (
             cell.operator.value("confocal_driver", "axes_subscribers") >= 1
             and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
+            and cell.operator.value("confocal_driver", "connections") >= 1
         ),
     )
-    return cell
 
 
 def reconnected(cell):
@@ -90,8 +89,8 @@ def start_scan_of_new_emulator(cell):
     pytest.fail("the new emulator never answered")
 
 
-def test_killed_and_restarted_emulator(correcting):
-    cell = correcting
+def test_killed_and_restarted_emulator(cell, true_calibration):
+    start_correcting(cell, true_calibration)
     assert cell.call(Trigger, "cell_emulator/scan").success
     cell.wait("half a scan", lambda: cell.operator.value("corrector", "axes_received") > 5000)
     cell.processes.end("cell_emulator", how=signal.SIGKILL)
@@ -120,11 +119,8 @@ def test_killed_and_restarted_emulator(correcting):
         assert sum(counts.values()) == delivered
 
 
-def test_noise_on_the_wire(correcting):
-    cell = correcting
-    cell.processes.end("cell_emulator")
-    cell.start_emulator(fault_noise=0.01, fault_flip=0.01, fault_drop=0.01)
-    reconnected(cell)
+def test_noise_on_the_wire(cell, true_calibration):
+    start_correcting(cell, true_calibration, fault_noise=0.01, fault_flip=0.01, fault_drop=0.01)
     assert cell.call(Trigger, "cell_emulator/scan").success
     cell.wait(
         "the noisy scan", lambda: cell.operator.value("cell_emulator", "samples_played") >= 20_000
