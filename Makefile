@@ -11,6 +11,8 @@ RUN := . ./env.sh &&
 
 # The matrices here are small: threads of BLAS would only get into each other's way.
 export OMP_NUM_THREADS ?= 1
+# The last numpy for Python 3.10 has older types, which disagree with today's in details.
+NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
@@ -27,7 +29,7 @@ test: lint
 lint: setup
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
-	$(RUN) mypy
+	$(RUN) if python -c "$(NUMPY_TYPED)"; then mypy; fi
 
 bench: $(PEERS)
 	$(RUN) python -m benchmarks
