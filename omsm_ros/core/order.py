@@ -58,7 +58,7 @@ def information(fit: Fit, colour: float = 1.0) -> float:
         parameter explains that much more by chance, and has to explain it to be believed.
     """
     n = fit.samples
-    floor = np.finfo(np.float64).tiny
+    floor = float(np.finfo(np.float64).tiny)
     return float(
         n * np.log(max(fit.sum_of_squares, floor) / n) + colour * fit.structure.size * np.log(n)
     )
