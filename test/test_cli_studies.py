@@ -83,6 +83,26 @@ def test_compare_sees_a_change_and_only_a_change(capsys, tmp_path, true_calibrat
     assert changed["delay_sigmas"] == pytest.approx(20 / np.sqrt(2), rel=0.01)
 
 
+def test_compare_of_three_or_more_says_how_well_they_repeat(capsys, tmp_path, true_calibration):
+    p = true_calibration.covariance.shape[0]
+    spread = np.zeros((p, p))
+    spread[-1, -1] = (1e-6) ** 2
+    g = true_calibration.dynamics
+    paths = []
+    for index, off in enumerate((0.0, 1e-6, 2e-6, 30e-6)):
+        late = TransferFunction(g.numerator, g.denominator, g.delay + off)
+        paths.append(tmp_path / f"{index}.json")
+        certificate = {"verdict": "accepted"}
+        made = replace(true_calibration, dynamics=late, covariance=spread, certificate=certificate)
+        files.save_calibration(paths[-1], made)
+    alike = facts(capsys, "compare", *paths[:3])
+    assert alike["repeatable"]
+    assert alike["count"] == 3
+    assert alike["delay"]["deviation"] == pytest.approx(1e-6)
+    assert len(alike["phase_deviation"]) == len(alike["frequency"])
+    assert not facts(capsys, "compare", *paths)["repeatable"]
+
+
 @pytest.fixture(scope="module")
 def scan_bag(tmp_path_factory, small_scan):
     return write(tmp_path_factory.mktemp("scan") / "scan.mcap", small_scan)

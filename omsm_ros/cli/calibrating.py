@@ -14,6 +14,7 @@ from omsm_ros.cli.command import Command, Facts, json_object, positive, progress
 from omsm_ros.core.calibration import Calibration, verdict_of
 from omsm_ros.core.drift import compare
 from omsm_ros.core.identify import identify
+from omsm_ros.core.repeatability import Repeatability, repeatability
 from omsm_ros.core.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.files import load_calibration, save_calibration, save_text
 from omsm_ros.units import DEGREE_RAD, MICROSECOND_S, NANOMETRE_M
@@ -134,11 +135,29 @@ def _show_verify(facts: Facts) -> None:
 def _declare_compare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("old", type=Path, metavar="OLD.json")
     sub.add_argument("new", type=Path, metavar="NEW.json")
+    sub.add_argument(
+        "more",
+        type=Path,
+        nargs="*",
+        metavar="MORE.json",
+        help="with three or more: do they scatter as little as they state?",
+    )
 
 
 def _compare(args: argparse.Namespace) -> Facts:
-    change = compare(load_calibration(args.old), load_calibration(args.new))
+    calibrations = [load_calibration(path) for path in (args.old, args.new, *args.more)]
+    if len(calibrations) > 2:
+        return _repeatability_facts(repeatability(calibrations))
+    change = compare(*calibrations)
     return asdict(change) | {"text": change.text()}
+
+
+def _repeatability_facts(found: Repeatability) -> Facts:
+    arrays = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in asdict(found).items()
+    }
+    return arrays | {"text": found.text()}
 
 
 # ---------------------------------------------------------------------------------- plan
@@ -200,7 +219,7 @@ COMMANDS = (
     ),
     Command(
         "compare",
-        "has the machine changed between two calibrations?",
+        "has the machine changed between two calibrations? Do three or more repeat?",
         _declare_compare,
         _compare,
         lambda facts: print(facts["text"]),

@@ -7,7 +7,7 @@ same, or changed by so much at so many sigma.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,11 +20,12 @@ from omsm_ros.errors import CalibrationError
 
 _LINES = 30
 # One in a thousand comparisons of an unchanged machine calls it changed.
-_SIGNIFICANCE = 1e-3
+SIGNIFICANCE = 1e-3
 # Near the end of the trusted band two structures may differ by more than the noise of either.
 _COMPARED_PART = 1 / 3
 # Directions of the response known this much worse than the best say nothing.
 _RANK_TOLERANCE = 1e-2
+_LEAST_BAND_HZ = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,18 +64,13 @@ def compare(old: Calibration, new: Calibration) -> Change:
 
     Raises CalibrationError when there is no band that both know.
     """
-    top = min(old.valid_up_to, new.valid_up_to) * _COMPARED_PART
-    if not top > 0.1:
-        raise CalibrationError(
-            f"no common band: valid up to {old.valid_up_to!r} Hz and {new.valid_up_to!r} Hz"
-        )
-    lines = np.linspace(top / _LINES, top, _LINES)
+    lines = common_lines((old, new))
     ratio = np.log(new.dynamics.response(lines) / old.dynamics.response(lines))
     difference = np.concatenate([ratio.real, np.angle(np.exp(1j * ratio.imag))])
-    covariance = _response_covariance(old, lines) + _response_covariance(new, lines)
-    statistic, known = _mahalanobis(difference, covariance)
+    covariance = response_covariance(old, lines) + response_covariance(new, lines)
+    statistic, known = mahalanobis(difference, covariance)
     gain_change = new.static_gain / old.static_gain - 1
-    gain_sigma = math.hypot(*(_gain_uncertainty(c.certificate) for c in (old, new)))
+    gain_sigma = math.hypot(*(gain_uncertainty(c.certificate) for c in (old, new)))
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
     p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
@@ -89,16 +85,26 @@ def compare(old: Calibration, new: Calibration) -> Change:
         static_gain=float(gain_change),
         static_gain_sigmas=float(gain_sigmas),
         p_value=p_value,
-        changed=p_value < _SIGNIFICANCE,
+        changed=p_value < SIGNIFICANCE,
     )
 
 
-def _response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArray:
+def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
+    """Frequencies (k,) [Hz] that all ``calibrations`` know well; CalibrationError if none."""
+    limits = [calibration.valid_up_to for calibration in calibrations]
+    top = min(limits) * _COMPARED_PART
+    if not top > _LEAST_BAND_HZ:
+        raise CalibrationError(f"no common band: valid up to {limits!r} Hz")
+    return np.asarray(np.linspace(top / _LINES, top, _LINES))
+
+
+def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArray:
+    """Of relative gain, then phase [rad], at ``lines`` (k,) [Hz]; shape (2k, 2k)."""
     jacobian = relative_response_jacobian(calibration.dynamics, lines).reshape(2 * len(lines), -1)
     return np.asarray(jacobian @ calibration.covariance @ jacobian.T)
 
 
-def _mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, int]:
+def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, int]:
     """χ² of ``difference`` in the directions that ``covariance`` spans, and their number."""
     scale = np.sqrt(np.diag(covariance))
     scale[scale == 0] = 1.0
@@ -108,6 +114,7 @@ def _mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float,
     return float(np.sum(along**2 / values[known])), int(np.sum(known))
 
 
-def _gain_uncertainty(certificate: Mapping[str, object]) -> float:
+def gain_uncertainty(certificate: Mapping[str, object]) -> float:
+    """Standard uncertainty of the static gain [1], 0 where none is stated."""
     value = certificate.get("static_gain_uncertainty", 0.0)
     return float(value) if isinstance(value, (int, float)) else 0.0

@@ -25,6 +25,7 @@ from omsm_ros.core.confidence import (
 )
 from omsm_ros.core.grey_box import table_mass, two_mass_entry
 from omsm_ros.core.hankel import HankelVote, hankel_vote
+from omsm_ros.core.initial_state import still_decays
 from omsm_ros.core.inter_sample import inter_sample_delay_bound
 from omsm_ros.core.motion_record import MotionRecord
 from omsm_ros.core.multibody import finite_values, modal_terms, shape
@@ -72,12 +73,11 @@ def identify(
         certificate has the masses and springs of a response that is that of two masses
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
-    did not see it, ConfigurationError for an option or a mass that can't be. A model that can be had but not trusted is returned with the verdict
-    "rejected" in its certificate.
+    did not see it, ConfigurationError for an input or a mass that cannot be. A model that can
+    be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
     mass = table_mass(settings or {})
-    prepared = prepare(record, input)
-    model = choose_model(prepared, order)
+    prepared, model = _modelled(prepare(record, input), order)
     check_gain(model.chosen.fit.gain)
     known = _Known.of(prepared, model, limits)
     dynamics, covariance = model.chosen.fit.dynamics, known.covariance
@@ -86,9 +86,8 @@ def identify(
         model.chosen,
         model.candidates,
         model.vote,
-        _evidence(prepared, model, known, noise, limits),
-        {"input": input}
-        | _further(record, prepared, model, known)
+        _evidence(prepared, model, known, noise),
+        _further(record, prepared, model, known)
         | {"two_mass": two_mass_entry(dynamics, covariance, known.valid_up_to, mass)},
     )
     static_gain = abs(model.chosen.fit.gain)
@@ -134,6 +133,16 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     return Model(chosen, candidates, vote)
 
 
+def _modelled(prepared: Prepared, order: int) -> tuple[Prepared, Model]:
+    """The model, with free decays in the problem where something still rang at its start."""
+    model = choose_model(prepared, order)
+    colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
+    if not still_decays(prepared.problem, model.chosen.fit, colour):
+        return prepared, model
+    prepared = replace(prepared, problem=replace(prepared.problem, starts_moving=True))
+    return prepared, choose_model(prepared, order)
+
+
 @dataclass(frozen=True, eq=False)
 class _Known:
     """How well the chosen model is known.
@@ -171,13 +180,7 @@ def _delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> fl
     return float(low.phase[0] / (2 * np.pi * _LOW_FREQUENCY_HZ))
 
 
-def _evidence(
-    prepared: Prepared,
-    model: Model,
-    known: _Known,
-    noise: float | None,
-    limits: ResponseLimits,
-) -> Evidence:
+def _evidence(prepared: Prepared, model: Model, known: _Known, noise: float | None) -> Evidence:
     best, problem = model.chosen.fit, prepared.problem
     tests = residual_tests(problem, best, prepared.steps, noise)
     return Evidence(
@@ -187,7 +190,6 @@ def _evidence(
         whiteness=tests.whiteness,
         independence=tests.independence,
         valid_up_to=known.valid_up_to,
-        limits=limits,
         nyquist=0.5 / problem.period,
         delay_noise=_delay_uncertainty(best.dynamics, known.from_noise),
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),

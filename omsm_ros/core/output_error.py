@@ -35,6 +35,8 @@ _INSENSITIVE = 1e-10
 _SMALLEST_STEP = 1e-9
 _LONGEST_STEP = 3.0
 _CONVERGED = 1e-4
+# The pulse before a record has this content left, as a power of e, where its band ends.
+_PULSE_END = 14.0
 
 
 def close_period(motion: FloatArray, period: float) -> FloatArray:
@@ -71,6 +73,7 @@ class Problem:
     background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
+    starts_moving: fit also free decays, of what moved before the first sample
     """
 
     motion: FloatArray
@@ -80,6 +83,7 @@ class Problem:
     background: FloatArray
     rate: float
     noise: float = 0.0
+    starts_moving: bool = False
 
     @cached_property
     def closed_length(self) -> int:
@@ -94,7 +98,9 @@ class Problem:
     @cached_property
     def _spectrum(self) -> ComplexArray:
         raw = np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
-        return denoised(raw, self.closed_length * self.noise**2)
+        moved = denoised(raw, self.closed_length * self.noise**2)
+        # A decay may be faster than anything in the motion: then the whole band is needed.
+        return np.pad(moved, (0, len(raw) - len(moved))) if self.starts_moving else moved
 
     @cached_property
     def s(self) -> ComplexArray:
@@ -104,7 +110,26 @@ class Problem:
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """What drives the system: spectra (k,), each with its number of numerator terms."""
-        return [(self._spectrum, structure.zeros + 1)]
+        motion = (self._spectrum, structure.zeros + 1)
+        return [motion, (self._pulse, structure.poles)] if self.starts_moving else [motion]
+
+    @cached_property
+    def _pulse(self) -> ComplexArray:
+        """Spectrum (k,) of a Gaussian that is over before the first sample.
+
+        After it, its n derivatives through n poles are as many free decays, and any of them.
+        """
+        angle = self.s.imag * self.rate
+        width = np.sqrt(2 * _PULSE_END) / max(float(angle[-1]), np.finfo(np.float64).tiny)
+        centre = -np.sqrt(2 * _PULSE_END) * width
+        return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
+
+    def free_decays(self, fitted: Fit) -> FloatArray:
+        """Free decays of the poles of ``fitted`` from before the first sample, (n, poles)."""
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
+        spectra = powers * (lag * self._pulse)
+        return np.asarray(fft.irfft(spectra, self.closed_length)[:, : len(self.motion)].T)
 
     @cached_property
     def _target(self) -> FloatArray:
@@ -146,12 +171,15 @@ class Problem:
         return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
-        """d output / d(numerator[1:], ψ, gain, background), shape (k, m + len ψ + 1 + q)."""
+        """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
         lag, relative = fitted.scaled.lag(fitted.shape, self.s)
-        driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
-        response = fitted.numerator @ driven
-        by_dynamics = self._in_time(np.concatenate([driven[1:], relative * response])).T
-        return np.column_stack([fitted.gain * by_dynamics, self._in_time(response), self._fixed])
+        driven = self._driven(fitted.structure, lag)
+        terms = len(fitted.numerator)
+        by_numerator = fitted.gain * driven[1:terms]
+        by_shape = relative * (fitted.driven @ driven)
+        by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
+        every = np.concatenate([by_numerator, by_shape, by_gain, driven[terms:]])
+        return np.column_stack([self._in_time(every).T, self._fixed])
 
 
 def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
