@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.confidence import ResponseLimits
 from omsm_ros.core.hankel import HankelVote
 from omsm_ros.core.order import Candidate
 from omsm_ros.core.transfer_function import TransferFunction
@@ -27,6 +28,7 @@ class Evidence:
     chi_square: mean square of the residual where the axis moves over that of the noise
     noise: standard deviation of a reading, known or taken where the axis rests
     whiteness, independence: p-values of the residual's tests
+    limits: of the 95 % band, within which the response is trusted up to ``valid_up_to``
     delay_noise, delay_uncertainty: of the low-frequency delay, from noise alone and in all
     """
 
@@ -36,6 +38,7 @@ class Evidence:
     whiteness: float
     independence: float
     valid_up_to: float
+    limits: ResponseLimits
     nyquist: float
     delay_noise: float
     delay_uncertainty: float
@@ -75,6 +78,13 @@ def certify(
         "modes": [
             {"frequency_hz": mode.frequency, "damping": mode.damping} for mode in dynamics.modes()
         ],
+        "limits": {
+            "gain": evidence.limits.gain,
+            "phase_rad": evidence.limits.phase,
+            "chi_square_least": _LEAST_CHI_SQUARE,
+            "chi_square_greatest": _WORST_CHI_SQUARE,
+            "valid_up_to_least_hz": _LEAST_TRUSTED_HZ,
+        },
         **further,
         "warnings": warnings,
         "reasons": reasons,

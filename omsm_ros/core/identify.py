@@ -86,8 +86,9 @@ def identify(
         model.chosen,
         model.candidates,
         model.vote,
-        _evidence(prepared, model, known, noise),
-        _further(record, prepared, model, known)
+        _evidence(prepared, model, known, noise, limits),
+        {"input": input}
+        | _further(record, prepared, model, known)
         | {"two_mass": two_mass_entry(dynamics, covariance, known.valid_up_to, mass)},
     )
     static_gain = abs(model.chosen.fit.gain)
@@ -180,7 +181,13 @@ def _delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> fl
     return float(low.phase[0] / (2 * np.pi * _LOW_FREQUENCY_HZ))
 
 
-def _evidence(prepared: Prepared, model: Model, known: _Known, noise: float | None) -> Evidence:
+def _evidence(
+    prepared: Prepared,
+    model: Model,
+    known: _Known,
+    noise: float | None,
+    limits: ResponseLimits,
+) -> Evidence:
     best, problem = model.chosen.fit, prepared.problem
     tests = residual_tests(problem, best, prepared.steps, noise)
     return Evidence(
@@ -190,6 +197,7 @@ def _evidence(prepared: Prepared, model: Model, known: _Known, noise: float | No
         whiteness=tests.whiteness,
         independence=tests.independence,
         valid_up_to=known.valid_up_to,
+        limits=limits,
         nyquist=0.5 / problem.period,
         delay_noise=_delay_uncertainty(best.dynamics, known.from_noise),
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),

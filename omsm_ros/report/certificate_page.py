@@ -245,6 +245,7 @@ def sections(certificate: Certificate) -> list[Section]:
                 tables.mode_table(calibration),
                 tables.modal_table(entries),
                 tables.two_mass_table(entries),
+                tables.limit_table(entries),
                 tables.shape_table(entries),
                 tables.coefficient_table(calibration),
             ),

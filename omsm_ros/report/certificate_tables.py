@@ -26,7 +26,7 @@ _SHOWN = {
     "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
     "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
     "shape", "modal_terms", "two_mass", "static_gains", "nonparametric_agreement", "samples",
-    "warnings", "reasons", "verdict",
+    "warnings", "reasons", "verdict", "limits", "input",
 }  # fmt: skip
 
 Certificate = Mapping[str, Any]
@@ -289,6 +289,31 @@ def sample_account(certificate: Certificate) -> Table:
         for reason, value in (account.items() if isinstance(account, Mapping) else ())
     ]
     return Table("Samples", (), rows)
+
+
+_LIMITS = (
+    ("95 % band of the gain, half-width, at most", "gain", ""),
+    ("95 % band of the phase, half-width, at most", "phase_rad", "rad"),
+    ("χ² where the axis moves, at least", "chi_square_least", ""),
+    ("χ² where the axis moves, at most", "chi_square_greatest", ""),
+    ("trusted band, to at least", "valid_up_to_least_hz", "Hz"),
+)
+
+
+def limit_table(certificate: Certificate) -> Table:
+    """What the verdict was measured against."""
+    rows = [
+        (
+            name,
+            plain(part(certificate, "limits", key))
+            if not unit
+            else quantity(part(certificate, "limits", key), unit),
+        )
+        for name, key, unit in _LIMITS
+    ]
+    source = certificate.get("input")
+    rows.append(("motion taken from", source if isinstance(source, str) else NOTHING))
+    return Table("Limits of the verdict", (), _known(rows, 1))
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.certificate import Evidence, certify
+from omsm_ros.core.confidence import ResponseLimits
 from omsm_ros.core.hankel import HankelVote
 from omsm_ros.core.order import Candidate
 from omsm_ros.core.structure import Structure
@@ -19,6 +20,7 @@ GOOD = Evidence(
     whiteness=0.5,
     independence=0.5,
     valid_up_to=80.0,
+    limits=ResponseLimits(gain=0.01, phase=0.02),
     nyquist=500.0,
     delay_noise=1e-6,
     delay_uncertainty=1e-6,
@@ -66,3 +68,18 @@ def test_a_pole_beyond_the_trusted_band_is_warned_of():
 
 def test_further_values_are_kept():
     assert certificate(GOOD)["polarity"] == 1
+
+
+def test_the_limits_of_the_verdict_are_written_down():
+    """A reader must be able to repeat the verdict from the certificate alone."""
+    limits = certificate(GOOD)["limits"]
+    assert limits["gain"] == 0.01
+    assert limits["phase_rad"] == 0.02
+    just_below = replace(GOOD, chi_square=0.999 * limits["chi_square_greatest"])
+    just_above = replace(GOOD, chi_square=1.001 * limits["chi_square_greatest"])
+    assert certificate(just_below)["verdict"] != "rejected"
+    assert certificate(just_above)["verdict"] == "rejected"
+    quiet = replace(GOOD, chi_square=0.999 * limits["chi_square_least"])
+    assert certificate(quiet)["verdict"] == "rejected"
+    short = replace(GOOD, valid_up_to=0.999 * limits["valid_up_to_least_hz"])
+    assert certificate(short)["verdict"] == "rejected"
