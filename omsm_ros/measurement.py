@@ -49,12 +49,14 @@ def measure(
     options: CorrectionOptions | None = None,
     admission: Admission | None = None,
     lateral: float = 0.0,
+    by_stamps: offline.ByStamps | None = None,
     report: bool = True,
     progress: offline.Progress = offline.no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
 
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
+    by_stamps: see :func:`omsm_ros.offline.correct_bag`
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
@@ -73,6 +75,7 @@ def measure(
         options=options,
         nominal=nominal,
         lateral=lateral,
+        by_stamps=by_stamps,
         comment=comment,
         progress=progress,
     )

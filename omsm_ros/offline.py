@@ -14,6 +14,7 @@ import numpy as np
 
 from omsm_ros import bags
 from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.clocks import axes_at_probe
 from omsm_ros.core.correct import CorrectionOptions, Corrector
 from omsm_ros.core.predict import Prediction, predict_error
 from omsm_ros.core.records import (
@@ -57,12 +58,24 @@ def read_blocks(
 # ---------------------------------------------------------------------------- correction
 
 
+@dataclass(frozen=True)
+class ByStamps:
+    """Probe and axes joined by their stamps, not by a common trigger counter.
+
+    delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
+    exposure: over which the probe averages [s]
+    """
+
+    delay: float = 0.0
+    exposure: float = 0.0
+
+
 def sample_period_of(path: Path) -> float:
-    """Sample period of the axes in a bag [s], from the first block."""
+    """Sample period of the probe in a bag [s], from the first block."""
     with bags.BagReader(path) as bag:
-        for _, block in bag.records(bags.AXES_TOPIC):
+        for _, block in bag.records(bags.DISTANCE_TOPIC):
             return float(block.sample_period)
-    raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a scan")
+    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
 
 
 @dataclass(frozen=True)
@@ -86,6 +99,7 @@ def correct_bag(
     options: CorrectionOptions | None = None,
     nominal: Surface | None = None,
     lateral: float = 0.0,
+    by_stamps: ByStamps | None = None,
     comment: str = "",
     progress: Progress = no_progress,
 ) -> Correction:
@@ -93,7 +107,8 @@ def correct_bag(
 
     nominal, lateral: surface, and standard uncertainty of a point sideways [m], which costs
         height where the surface slopes
-    Memory does not grow with the bag. Leaves no cloud behind when it fails.
+    by_stamps: join the streams by their stamps; None: by the trigger counter they share
+    Memory does not grow with the bag, but for ``by_stamps``. Leaves no cloud behind when it fails.
     """
     corrector = Corrector(calibration, options or CorrectionOptions())
     topics = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
@@ -107,7 +122,10 @@ def correct_bag(
             if points is not None:
                 ply.write(with_lateral(points, nominal, lateral) if nominal and lateral else points)
 
-        for done, record in _gathered(bag.records(*topics)):
+        records = bag.records(*topics)
+        if by_stamps is not None:
+            records = _joined_by_stamps(records, by_stamps)
+        for done, record in _gathered(records):
             if isinstance(record, AxisBlock):
                 corrector.push_axes(record)
             elif isinstance(record, DistanceBlock):
@@ -117,6 +135,20 @@ def correct_bag(
         write(corrector.finish())
     account = dict(corrector.account.as_dict())
     return Correction(account, corrector.budget, corrector.stamp_skew)
+
+
+def _joined_by_stamps(records: Iterable[bags.Item], how: ByStamps) -> Iterator[bags.Item]:
+    """The axes at the probe's samples, and the probe's blocks, as if one trigger had both."""
+    axes, distance = [], []
+    for _, block in records:
+        if isinstance(block, AxisBlock):
+            axes.append(block)
+        elif isinstance(block, DistanceBlock):
+            distance.append(block)
+    moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
+    for axis_block, reading in zip(moved, distance, strict=True):
+        yield bags.AXES_TOPIC, axis_block
+        yield bags.DISTANCE_TOPIC, reading
 
 
 def _gathered(records: Iterable[bags.Item]) -> Iterator[tuple[int, Block]]:

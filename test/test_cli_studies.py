@@ -11,6 +11,7 @@ from omsm_ros.core.surface import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.core.trajectory import Chirp, Spiral
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.twin.cell import Cell, blocks_of, record
+from omsm_ros.twin.scenario import Scenario, spiral_of
 
 SPHERE_RADIUS_M = 0.05
 
@@ -207,3 +208,28 @@ def test_correct_refuses_a_foreign_calibration_unless_told(capsys, tmp_path, sca
     assert any("another" in text for text in summary["warnings"])
     head = (tmp_path / "b" / "cloud.ply").read_bytes()[:512]
     assert b"OVERRIDDEN" in head
+
+
+def test_streams_of_different_rates_are_joined_by_their_stamps(
+    capsys, tmp_path, small_scan, calibration
+):
+    """Axes twice as fast, with a counter of their own and 0.3 ms ahead of the probe's clock."""
+    fast = record(Cell(sample_period=0.5e-3), spiral_of(Scenario(start_radius=2e-3)), PAPER_MIRROR)
+    ahead_ns = 300_000
+    path = tmp_path / "two_clocks.mcap"
+    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, _ in blocks_of(fast, 1000):
+            stamp, count = axes.stamp_ns + 10**9 + ahead_ns, axes.first_sample + 77
+            bag.write_axes(replace(axes, stamp_ns=stamp, first_sample=count))
+        for _, distance in blocks_of(small_scan, 1000):
+            bag.write_distance(replace(distance, stamp_ns=distance.stamp_ns + 10**9))
+    arguments = ["correct", path, "--calibration", calibration, "--out", tmp_path / "out"]
+    arguments += ["--by-stamps", "--delay", "0.3e-3", "--no-report", "--json"]
+    assert cli.main([*map(str, arguments)]) == 0
+    account = json.loads(capsys.readouterr().out)["samples"]["distance"]
+    assert account["received"] == 40_000
+    assert account["corrected"] > 39_900
+    assert account["corrected"] + sum(account["counted"].values()) == 40_000
+    cloud = files.CloudFile(tmp_path / "out" / "cloud.ply").read()
+    error = cloud["height"] - small_scan.surface_height[cloud["sample"]]
+    assert np.sqrt(np.mean(error**2)) < 1.1 * np.hypot(10e-9, 10e-9 / np.sqrt(12))

@@ -66,6 +66,13 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
         "--lateral", type=positive, default=0.0, help="standard uncertainty of x and y [m]"
     )
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
+    sub.add_argument(
+        "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
+    )
+    sub.add_argument(
+        "--delay", type=float, default=0.0, help="from the probe's stamp to its exposure [s]"
+    )
+    sub.add_argument("--exposure", type=float, default=0.0, help="of the probe [s]")
     sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
     sub.add_argument(
@@ -92,6 +99,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             options=options,
             admission=Admission(args.settings, args.override),
             lateral=args.lateral,
+            by_stamps=offline.ByStamps(args.delay, args.exposure) if args.by_stamps else None,
             report=not args.no_report,
             progress=progress,
         )
