@@ -22,7 +22,7 @@ def test_response_and_poles_are_the_same():
 
 
 def test_step_response_settles_at_the_static_gain():
-    time = np.linspace(0, 0.02, 2001)
+    time = np.linspace(0, 0.02, 20_001)
     response = control.step_response(to_control(PAPER_DYNAMICS), time)
     assert response.outputs[-1] == pytest.approx(1.0, abs=1e-6)
     # The area above the response to a step is the lag of a slow motion.
