@@ -127,7 +127,7 @@ def _reading(
         stamp_ns=0,
         first_sample=0,
         sample_period=period,
-        distance=np.where(in_range, reading, 0.0),
+        distance=np.where(in_range, reading, np.nan),
         intensity=np.where(in_range, 0.5, 0.0).astype(np.float32),
         status=np.where(in_range, Status.OK, Status.NO_TARGET).astype(np.uint8),
     )

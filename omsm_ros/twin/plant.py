@@ -71,7 +71,8 @@ def respond(
 
     Each sample period is cut into ``substeps``; the command is held at its value in the
     middle of each, which is exact for a sharp step on the grid and of second order for
-    a smooth motion. The delay is taken in the argument of the command, so it is exact too.
+    a smooth motion. The delay is taken in the argument of the command, so it is exact too;
+    only a sharp step that it moves off the grid is off by up to half a substep.
     """
     step = sample_period / substeps
     lead = int(np.ceil(plant.lead_in() / sample_period))
