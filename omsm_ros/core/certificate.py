@@ -75,9 +75,6 @@ def certify(
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": evidence.delay_uncertainty,
         "inter_sample_delay_bound_s": evidence.inter_sample_delay_bound,
-        "modes": [
-            {"frequency_hz": mode.frequency, "damping": mode.damping} for mode in dynamics.modes()
-        ],
         "limits": {
             "gain": evidence.limits.gain,
             "phase_rad": evidence.limits.phase,

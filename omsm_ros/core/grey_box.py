@@ -7,12 +7,12 @@ from dataclasses import asdict
 
 import numpy as np
 
-from omsm_ros.core.multibody import TwoMassFit, fit_two_mass, modal_terms
+from omsm_ros.core.multibody import FITTED, TwoMassFit, fit_two_mass, oscillations
 from omsm_ros.core.records import FloatArray
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError
 
-# The setting without which masses and springs are known only relative to each other.
+# The setting without which masses, springs and dampers are known only per mass of the table.
 TABLE_MASS_SETTING = "table_mass_kg"
 _LINES = 40
 # rms of the difference of response over its uncertainty: beyond this it is another machine.
@@ -42,20 +42,27 @@ def two_mass_entry(
 ) -> dict[str, object] | None:
     """The two-mass model that ``dynamics`` agrees with up to ``up_to`` [Hz]; None if none does.
 
-    mass: of the table [kg]; None when it is not known, and then neither is anything else
+    mass: of the table [kg]; None when it is not known: then m1 is 1, and the others are per
+        mass of the table
+
     Eq. 7 is tried first (the probe on the second mass), then the driven mass itself.
     """
-    if mass is None or not up_to > 0 or len(modal_terms(dynamics)) < 2 or dynamics.delay > 0:
+    if not up_to > 0 or len(oscillations(dynamics)) < 2 or dynamics.delay > 0:
         return None
     lines = np.linspace(up_to / _LINES, up_to, _LINES)
     for collocated in (False, True):
         fitted = fit_two_mass(
-            dynamics, covariance, table_mass=mass, collocated=collocated, frequencies=lines
+            dynamics,
+            covariance,
+            table_mass=1.0 if mass is None else mass,
+            collocated=collocated,
+            frequencies=lines,
         )
         if _believable(fitted):
             return {
+                TABLE_MASS_SETTING: mass,
                 "model": asdict(fitted.model),
-                "uncertainty": fitted.uncertainty.tolist(),
+                "relative_uncertainty": dict(zip(FITTED, fitted.uncertainty.tolist(), strict=True)),
                 "misfit": fitted.misfit,
                 "collocated": collocated,
             }

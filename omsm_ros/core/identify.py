@@ -27,8 +27,9 @@ from omsm_ros.core.grey_box import table_mass, two_mass_entry
 from omsm_ros.core.hankel import HankelVote, hankel_vote
 from omsm_ros.core.initial_state import still_decays
 from omsm_ros.core.inter_sample import inter_sample_delay_bound
+from omsm_ros.core.modes import modal_remainder, mode_entries
 from omsm_ros.core.motion_record import MotionRecord
-from omsm_ros.core.multibody import finite_values, modal_terms, shape
+from omsm_ros.core.multibody import finite_values, shape
 from omsm_ros.core.order import Candidate, choose, explore, held_out_rms
 from omsm_ros.core.output_error import Fit, Problem, fit
 from omsm_ros.core.preparation import Prepared, check_gain, prepare
@@ -69,8 +70,8 @@ def identify(
     noise: known standard deviation of one reading of the probe [m], for χ²; None to take
         it where the axis rests
     limits: of the 95 % band, deciding ``valid_up_to``
-    settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the
-        certificate has the masses and springs of a response that is that of two masses
+    settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the masses
+        and springs of a response that is that of two masses are in SI, else per table mass
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
     did not see it, ConfigurationError for an input or a mass that cannot be. A model that can
@@ -219,7 +220,8 @@ def _further(
         "drift_m_s": 2 * float(best.background[1]) / (len(record) * record.sample_period),
         "backlash_m": backlash,
         "shape": finite_values(shape(best.dynamics, 0.5 / record.sample_period)),
-        "modal_terms": [asdict(term) for term in modal_terms(best.dynamics)],
+        "modes": mode_entries(best.dynamics, known.covariance),
+        "modal_remainder": modal_remainder(best.dynamics, known.valid_up_to),
         "static_gains": _attributed(record),
         "nonparametric_agreement": _agreement(prepared, best, known.valid_up_to),
         "samples": dict(record.counts) | {"spikes": prepared.spikes, "compared": best.samples},

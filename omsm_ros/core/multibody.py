@@ -1,11 +1,11 @@
-"""The machine as masses, springs and dampers: the paper's Eq. 6 to 9, and their fit to a G(s).
+"""The machine as masses, springs and dampers: the paper's Eq. 6 and 7, and their fit to a G(s).
 
 Two masses in a chain from the ground: ``m1`` on ``k1, c1``, and ``m2`` on ``m1`` through
 ``k2, c2``, driven by a force on ``m1``. Eq. 7 is the motion of ``m2`` (non-collocated); of
 ``m1`` itself it is the collocated one. Its printed ``a1 = (k1 + k2) c1`` does not follow
 from the equations of motion, and is unstable for ordinary machines; it is
 ``a1 = k1 c2 + k2 c1``. A response says nothing of the scale of masses and stiffnesses
-together, so one of them has to be known: ``m1``.
+together, so one of them has to be known, ``m1``, or taken as the unit of the others.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from omsm_ros.core.records import FloatArray
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.errors import DataError, IdentificationError
 
+# What a fit finds, in the order of its uncertainties; m1 is given.
+FITTED = ("m2", "k1", "k2", "c1", "c2")
 _LINES = 200
 # Natural logarithm of how far from its guess a mass or a spring may come out.
 _SEARCHED = 8.0
@@ -65,57 +67,6 @@ class TwoMass:
         return TransferFunction.from_ascending(numerator, self._denominator()).normalised()
 
 
-@dataclass(frozen=True)
-class ModalTerm:
-    """One term of Eq. 8: residue α/m [1/s²], undamped frequency [Hz], damping ratio."""
-
-    residue: float
-    frequency: float
-    damping: float
-
-
-def modal_sum(terms: tuple[ModalTerm, ...]) -> TransferFunction:
-    """Eq. 8, ``Σ residue / (s² + 2 ζ ω s + ω²)``; not normalised.
-
-    The print lacks the s behind 2 ζ ω. Raises DataError without terms.
-    """
-    if not terms:
-        raise DataError("a modal sum needs one term or more")
-    multiply, add = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyadd
-    numerator: FloatArray = np.zeros(1)
-    denominator: FloatArray = np.ones(1)
-    for term in terms:
-        omega = 2 * np.pi * term.frequency
-        section = [omega**2, 2 * term.damping * omega, 1.0]
-        added = add(multiply(numerator, section), term.residue * denominator)
-        numerator = np.asarray(added, np.float64)
-        denominator = np.asarray(multiply(denominator, section), np.float64)
-    return TransferFunction.from_ascending(numerator, denominator)
-
-
-def modal_terms(dynamics: TransferFunction) -> tuple[ModalTerm, ...]:
-    """Oscillating modes of G with the real part of their residue as in Eq. 8, slowest first.
-
-    At a pair p, p* the partial fractions are ``r/(s-p) + r*/(s-p*)``; its value at s = 0 is
-    ``-2 Re(r p*)/|p|²``, and the term of Eq. 8 with that value has the residue ``-2 Re(r p*)``.
-    """
-    poles = dynamics.poles()
-    derivative = np.polynomial.polynomial.polyder(dynamics.denominator)
-    found = []
-    for pole in poles[poles.imag > 0]:
-        residue = np.polynomial.polynomial.polyval(
-            pole, dynamics.numerator
-        ) / np.polynomial.polynomial.polyval(pole, derivative)
-        found.append(
-            ModalTerm(
-                float(-2 * np.real(residue * np.conj(pole))),
-                float(abs(pole) / (2 * np.pi)),
-                float(-pole.real / abs(pole)),
-            )
-        )
-    return tuple(sorted(found, key=lambda term: term.frequency))
-
-
 @dataclass(frozen=True, eq=False)
 class TwoMassFit:
     """model: fitted;  uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
@@ -138,15 +89,16 @@ def fit_two_mass(
     """Masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
 
     covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty
-    table_mass: m1 [kg], which no response can tell;  frequencies: lines to compare at [Hz]
+    table_mass: m1 [kg], which no response can tell; 1 for all others relative to it
+    frequencies: lines to compare at [Hz]
 
     Raises IdentificationError when G has fewer than two modes to explain.
     """
     lines = np.asarray(frequencies, np.float64)
-    terms = modal_terms(dynamics)
-    if len(terms) < 2:
+    oscillating = oscillations(dynamics)
+    if len(oscillating) < 2:
         raise IdentificationError(
-            f"the two-mass model needs two oscillating modes, the response has {len(terms)!r}"
+            f"the two-mass model needs two oscillating modes, the response has {len(oscillating)!r}"
         )
     target = np.log(dynamics.response(lines))
     whiten = _whitener(dynamics, covariance, lines)
@@ -167,7 +119,7 @@ def fit_two_mass(
             residual, start, x_scale="jac", bounds=box, max_nfev=evaluations
         )
 
-    raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(terms, table_mass)]
+    raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(oscillating, table_mass)]
     best = descend(min(raced, key=lambda found: float(found.cost)).x, None)
     sensitivity = np.linalg.pinv(best.jac) * whiten
     spread = sensitivity @ _stacked_jacobian(dynamics, lines)
@@ -190,9 +142,14 @@ def _whitener(dynamics: TransferFunction, covariance: FloatArray, lines: FloatAr
     return np.asarray(1 / np.sqrt(np.maximum(variance, floor)))
 
 
-def _starts(terms: tuple[ModalTerm, ...], table_mass: float) -> list[FloatArray]:
+def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
+    """Frequencies of the conjugate pairs of poles [Hz], lowest first."""
+    return tuple(mode.frequency for mode in dynamics.modes() if mode.damping < 1)
+
+
+def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:
     """Uncoupled guesses with either mode belonging to the second mass."""
-    low, high = (2 * np.pi * term.frequency for term in terms[:2])
+    low, high = (2 * np.pi * frequency for frequency in oscillating[:2])
     starts = []
     for ratio in (0.05, 0.2, 0.8):
         for first, second in ((low, high), (high, low)):

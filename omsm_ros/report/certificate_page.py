@@ -15,6 +15,7 @@ from omsm_ros.core.explained import Explained
 from omsm_ros.core.records import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.report import certificate_figures, style
+from omsm_ros.report import certificate_reading as reading
 from omsm_ros.report import certificate_tables as tables
 from omsm_ros.report.measured import measured, number, plain
 from omsm_ros.report.page import Headline
@@ -242,11 +243,10 @@ def sections(certificate: Certificate) -> list[Section]:
             "Dynamics",
             (),
             (
-                tables.mode_table(calibration),
-                tables.modal_table(entries),
-                tables.two_mass_table(entries),
+                reading.mode_table(calibration),
+                reading.two_mass_table(entries),
                 tables.limit_table(entries),
-                tables.shape_table(entries),
+                reading.shape_table(calibration),
                 tables.coefficient_table(calibration),
             ),
             "Uncertainties are standard, k = 1. Those of the coefficients are strongly "

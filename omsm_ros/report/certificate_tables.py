@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration import SCHEMA, Calibration
-from omsm_ros.core.modes import known_modes
 from omsm_ros.report.measured import measured, number, plain, probability, raised
 from omsm_ros.report.tables import NOTHING, Table, count, mapping_table, part, quantity
 from omsm_ros.units import PPM
@@ -25,7 +24,7 @@ _SHOWN = {
     "residual_rms_m", "noise_m", "edges", "whiteness_p", "independence_p",
     "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
     "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
-    "shape", "modal_terms", "two_mass", "static_gains", "nonparametric_agreement", "samples",
+    "shape", "modal_remainder", "two_mass", "static_gains", "nonparametric_agreement", "samples",
     "warnings", "reasons", "verdict", "limits", "input",
 }  # fmt: skip
 
@@ -98,7 +97,7 @@ def residual_table(certificate: Certificate) -> Table:
         ),
         ("edges", count(certificate.get("edges")), ""),
     ]
-    return Table("Tests of the residual", ("", "in words"), _known(rows, 1))
+    return Table("Tests of the residual", ("", "in words"), known_rows(rows, 1))
 
 
 def _in_words(p: float | None, good: str, bad: str) -> str:
@@ -139,76 +138,6 @@ def is_chosen(candidate: Mapping[str, Any], certificate: Certificate) -> bool:
     )
 
 
-def mode_table(calibration: Calibration) -> Table:
-    """The poles, and whether the band reaches them."""
-    rows = [
-        (
-            f"mode {index}" if mode.damping < 1 else f"real pole {index}",
-            measured(mode.frequency, mode.frequency_uncertainty, "Hz"),
-            measured(mode.damping, mode.damping_uncertainty)
-            if mode.damping < 1
-            else "1, by definition",
-            "yes" if mode.frequency <= calibration.valid_up_to else "no",
-        )
-        for index, mode in enumerate(known_modes(calibration), start=1)
-    ]
-    return Table("Modes", ("frequency", "damping ratio", "within the trusted band"), rows)
-
-
-def modal_table(certificate: Certificate) -> Table:
-    """Oscillating modes as the terms of Eq. 8."""
-    rows = [
-        (
-            f"term {index}",
-            quantity(term.get("frequency"), "Hz", 4),
-            plain(term.get("damping")),
-            plain(term.get("residue"), 4),
-        )
-        for index, term in enumerate(listed(certificate, "modal_terms"), start=1)
-    ]
-    return Table("Modal terms (Eq. 8)", ("frequency", "damping ratio", "residue [1/s²]"), rows)
-
-
-_MECHANICAL_UNITS = {"m1": "kg", "m2": "kg", "k1": "N/m", "k2": "N/m", "c1": "N·s/m", "c2": "N·s/m"}
-_FITTED = ("m2", "k1", "k2", "c1", "c2")
-
-
-def two_mass_table(certificate: Certificate) -> Table:
-    """Masses, springs and dampers, where a two-mass model was fitted."""
-    model: Mapping[str, Any] = part(certificate, "two_mass", "model") or {}
-    relative = part(certificate, "two_mass", "uncertainty")
-    spreads = dict(zip(_FITTED, relative, strict=False)) if isinstance(relative, list) else {}
-    rows = []
-    for name, unit in _MECHANICAL_UNITS.items():
-        value, spread = number(part(model, name)), number(spreads.get(name))
-        text = NOTHING if value is None else measured(value, (spread or 0.0) * value, unit)
-        rows.append((name, text))
-    misfit = plain(part(certificate, "two_mass", "misfit"))
-    rows.append(("misfit, over the stated uncertainty", misfit))
-    return Table("Two-mass model (Eq. 6, 7)", (), _known(rows, 1))
-
-
-_SHAPE_ROWS = (
-    ("gain off 1 by 1 %", "bandwidth_1_percent", None),
-    ("gain off 1 by 3 dB", "bandwidth_3db", None),
-    ("greatest gain", "resonance", "resonance_gain"),
-    ("least gain", "minimum", "minimum_gain"),
-)
-
-
-def shape_table(certificate: Certificate) -> Table:
-    """What stands out in the identified response."""
-    rows = [(name, _point(certificate, place, gain)) for name, place, gain in _SHAPE_ROWS]
-    return Table("Shape of the response", (), _known(rows, 1))
-
-
-def _point(certificate: Certificate, place: str, gain: str | None) -> str:
-    at = quantity(part(certificate, "shape", place), "Hz")
-    if gain is None or at == NOTHING:
-        return at
-    return f"{plain(part(certificate, 'shape', gain), 4)} at {at}"
-
-
 _GAINS = {
     "probe_per_encoder": "probe per encoder, at rest",
     "probe_per_reference": "probe per reference, at rest",
@@ -225,7 +154,7 @@ def gain_table(calibration: Calibration) -> Table:
         gain = part(certificate, "static_gains", key) or {}
         value, spread = part(gain, "value"), part(gain, "uncertainty")
         rows.append(_gain_row(name, value, spread))
-    return Table("Static gain", ("travel per travel", "from 1 [ppm]"), _known(rows, 1))
+    return Table("Static gain", ("travel per travel", "from 1 [ppm]"), known_rows(rows, 1))
 
 
 def _gain_row(name: str, value: object, uncertainty: object) -> tuple[str, ...]:
@@ -251,7 +180,7 @@ def background_table(certificate: Certificate) -> Table:
         ),
         ("distance", _POLARITIES.get(polarity, NOTHING) if isinstance(polarity, int) else NOTHING),
     ]
-    return Table("Besides the motion", (), _known(rows, 1))
+    return Table("Besides the motion", (), known_rows(rows, 1))
 
 
 def _or_none(value: object, unit: str) -> str:
@@ -313,7 +242,7 @@ def limit_table(certificate: Certificate) -> Table:
     ]
     source = certificate.get("input")
     rows.append(("motion taken from", source if isinstance(source, str) else NOTHING))
-    return Table("Limits of the verdict", (), _known(rows, 1))
+    return Table("Limits of the verdict", (), known_rows(rows, 1))
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
@@ -326,7 +255,7 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
         ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
         ("omsm_ros", version or NOTHING),
     ]
-    return Table("Identity", (), _known(rows, 1))
+    return Table("Identity", (), known_rows(rows, 1))
 
 
 def further_table(certificate: Certificate) -> Table:
@@ -335,5 +264,6 @@ def further_table(certificate: Certificate) -> Table:
     return mapping_table("Further entries", rest)
 
 
-def _known(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
+def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
+    """The rows that have something in ``column``."""
     return [row for row in rows if row[column] != NOTHING]

@@ -8,7 +8,7 @@ import pytest
 from omsm_ros.core.grey_box import table_mass, two_mass_entry
 from omsm_ros.core.identify import identify
 from omsm_ros.core.motion_record import assemble
-from omsm_ros.core.multibody import TwoMass, fit_two_mass
+from omsm_ros.core.multibody import FITTED, TwoMass, fit_two_mass
 from omsm_ros.core.surface import Flat
 from omsm_ros.core.trajectory import StepTest
 from omsm_ros.core.transfer_function import TransferFunction
@@ -18,7 +18,6 @@ from omsm_ros.twin.plant import Plant
 
 # Both modes, 57 and 89 Hz, lie where a step test tells them.
 MACHINE = TwoMass(m1=10.0, m2=2.0, k1=2e6, k2=4e5, c1=450.0, c2=60.0)
-FITTED = ("m2", "k1", "k2", "c1", "c2")
 
 
 @lru_cache(maxsize=4)
@@ -35,9 +34,10 @@ def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
     assert entry["collocated"] is collocated
     assert entry["misfit"] < 2.0
     assert entry["model"]["m1"] == 10.0
-    for name, relative in zip(FITTED, entry["uncertainty"], strict=True):
+    assert entry["table_mass_kg"] == 10.0
+    for name in FITTED:
         off = np.log(entry["model"][name] / getattr(MACHINE, name))
-        assert abs(off) < 4 * relative, name
+        assert abs(off) < 4 * entry["relative_uncertainty"][name], name
 
 
 def test_a_response_says_nothing_of_the_scale():
@@ -49,8 +49,21 @@ def test_a_response_says_nothing_of_the_scale():
         assert second["model"][name] == pytest.approx(2 * first["model"][name], rel=1e-3)
 
 
-def test_without_a_mass_there_is_no_model():
-    assert calibrated(False, None).certificate["two_mass"] is None
+@pytest.mark.parametrize("collocated", [False, True])
+def test_without_a_mass_all_is_per_mass_of_the_table(collocated):
+    """The truth over m1, within the stated uncertainty, and the fit with a mass over it."""
+    entry = calibrated(collocated, None).certificate["two_mass"]
+    with_mass = calibrated(collocated, 10.0).certificate["two_mass"]
+    assert entry["table_mass_kg"] is None
+    assert entry["model"]["m1"] == 1.0
+    assert entry["collocated"] is collocated
+    assert entry["misfit"] == pytest.approx(with_mass["misfit"], rel=1e-3)
+    for name in FITTED:
+        ratio, spread = entry["model"][name], entry["relative_uncertainty"][name]
+        off = np.log(ratio * MACHINE.m1 / getattr(MACHINE, name))
+        assert abs(off) < 4 * spread, name
+        assert ratio == pytest.approx(with_mass["model"][name] / 10.0, rel=1e-3 * spread)
+        assert spread == pytest.approx(with_mass["relative_uncertainty"][name], rel=1e-3)
 
 
 def test_what_is_not_two_masses_is_not_called_so():

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.multibody import (
-    ModalTerm,
     TwoMass,
     finite_values,
     fit_two_mass,
-    modal_sum,
-    modal_terms,
+    oscillations,
     shape,
 )
 from omsm_ros.core.transfer_function import TransferFunction
@@ -56,25 +54,11 @@ def test_a_mass_must_be_positive(value):
         TwoMass(m1=1.0, m2=value, k1=1.0, k2=1.0, c1=1.0, c2=1.0)
 
 
-def test_a_modal_sum_has_its_terms_as_modes():
-    terms = (ModalTerm(2e4, 40.0, 0.03), ModalTerm(-5e5, 150.0, 0.02))
-    found = modal_terms(modal_sum(terms))
-    for given, read in zip(terms, found, strict=True):
-        assert read.frequency == pytest.approx(given.frequency)
-        assert read.damping == pytest.approx(given.damping)
-        assert read.residue == pytest.approx(given.residue, rel=1e-6)
-
-
-def test_a_modal_sum_is_the_sum_of_its_terms():
-    terms = (ModalTerm(2e4, 40.0, 0.03), ModalTerm(5e5, 150.0, 0.02))
-    frequency = np.array([1.0, 39.0, 151.0])
-    alone = sum(modal_sum((term,)).response(frequency) for term in terms)
-    np.testing.assert_allclose(modal_sum(terms).response(frequency), alone)
-
-
-def test_no_terms_are_no_sum():
-    with pytest.raises(DataError, match="one term"):
-        modal_sum(())
+def test_only_conjugate_pairs_oscillate():
+    dynamics = MACHINE.non_collocated()
+    slow = np.polynomial.polynomial.polymul(dynamics.denominator, [1.0, 0.1])
+    damped = TransferFunction(dynamics.numerator, slow)
+    assert oscillations(damped) == pytest.approx([m.frequency for m in dynamics.modes()])
 
 
 @pytest.mark.parametrize("collocated", [False, True])

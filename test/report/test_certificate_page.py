@@ -28,7 +28,8 @@ from omsm_ros.report.certificate_page import (
     render,
     sections,
 )
-from omsm_ros.report.certificate_tables import mode_table, order_table, two_mass_table
+from omsm_ros.report.certificate_reading import mode_table, shape_table, two_mass_table
+from omsm_ros.report.certificate_tables import order_table
 
 VOID = {"meta", "img", "br"}
 ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
@@ -150,7 +151,7 @@ class TestPage:
                 "verdict": ATTACK, "reasons": [ATTACK], "warnings": [ATTACK], ATTACK: ATTACK,
                 "samples": {ATTACK: 3}, "structure": {"poles": ATTACK}, "candidates": [ATTACK],
                 "polarity": ATTACK, "shape": ATTACK, "static_gains": [ATTACK], "modes": ATTACK,
-                "two_mass": {"model": ATTACK}, "noise_m": ATTACK, "modal_terms": [{"x": ATTACK}],
+                "two_mass": {"model": ATTACK}, "noise_m": ATTACK, "modal_remainder": ATTACK,
             },
         )  # fmt: skip
         page = Page(render(Certificate(hostile, ATTACK, ATTACK, ATTACK)))
@@ -272,18 +273,53 @@ class TestNumbers:
         for valid, word in ((1.0, "no"), (400.0, "yes")):
             rows = mode_table(replace(calibration, valid_up_to=valid)).rows
             below = [m.frequency <= valid for m in calibration.dynamics.modes()]
-            assert [row[3] == "yes" for row in rows] == below
-            assert word in {row[3] for row in rows}
+            assert [row[4] == "yes" for row in rows] == below
+            assert word in {row[4] for row in rows}
+
+    def test_a_mode_has_frequency_damping_and_residue_with_uncertainties(self, calibration):
+        omega = 2 * np.pi * 60.0
+        lone = replace(
+            calibration,
+            dynamics=TransferFunction.from_ascending([1.0], [1.0, 0.04 / omega, omega**-2]),
+            # Of the stiffness alone, 0.2 %: half of it is the frequency's, all the residue's.
+            covariance=np.diag([0.0, 0.0, (2e-3 * omega**-2) ** 2, 0.0]),
+        )
+        (row,) = mode_table(lone).rows
+        frequency, damping, residue = (text.replace("\u202f", " ") for text in row[1:4])
+        assert frequency == "60.000 Hz ± 0.060 Hz"
+        assert damping == "0.020000 ± 0.000020"
+        assert residue == "0.14212 ± 0.00028"
+
+    def test_a_point_beyond_the_trusted_band_says_so(self, calibration):
+        shape = {"minimum": 347.0, "minimum_gain": 0.882, "bandwidth_1_percent": 40.0}
+        seen = replace(certified(calibration, shape=shape), valid_up_to=100.0)
+        assert [row[2] for row in shape_table(seen).rows] == ["yes", "no"]
+
+    def two_mass_rows(self, mass):
+        model = {"m1": mass or 1.0, "m2": 2.0, "k1": 3e7, "k2": 5e6, "c1": 900.0, "c2": 80.0}
+        spreads = {"m2": 0.01, "k1": 0.02, "k2": 0.03, "c1": 0.04, "c2": 0.05}
+        entry = {
+            "table_mass_kg": mass, "model": model, "relative_uncertainty": spreads,
+            "misfit": 0.9, "collocated": False,
+        }  # fmt: skip
+        table = two_mass_table({"two_mass": entry})
+        return table.title, {name: text.replace("\u202f", " ") for name, text in table.rows}
 
     def test_a_two_mass_model_has_units_and_uncertainties(self):
-        model = {"m1": 40.0, "m2": 2.0, "k1": 3e7, "k2": 5e6, "c1": 900.0, "c2": 80.0}
-        entry = {"model": model, "uncertainty": [0.01, 0.02, 0.03, 0.04, 0.05], "misfit": 0.9}
-        rows = dict(two_mass_table({"two_mass": entry}).rows)
-        texts = {name: text.replace("\u202f", " ") for name, text in rows.items()}
+        _, texts = self.two_mass_rows(40.0)
         assert texts["m1"] == "40.00 kg"
         assert texts["m2"] == "2.000 kg ± 0.020 kg"
         assert texts["k2"] == "5.00 MN/m ± 0.15 MN/m"
         assert texts["c2"] == "80.0 N·s/m ± 4.0 N·s/m"
+        assert "not the driven one" in texts["probe on the"]
+
+    def test_without_the_mass_of_the_table_all_is_per_mass(self):
+        title, texts = self.two_mass_rows(None)
+        assert title.endswith("per mass of the table")
+        assert "m1" not in texts
+        assert texts["m2 / m1"] == "2.000 ± 0.020"
+        assert texts["k2 / m1"] == "5.00 MN/(m·kg) ± 0.15 MN/(m·kg)"
+        assert texts["c2 / m1"] == "80.0 N·s/(m·kg) ± 4.0 N·s/(m·kg)"
 
 
 class TestMarkdown:
