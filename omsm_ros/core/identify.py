@@ -162,7 +162,8 @@ class _Known:
     def of(cls, prepared: Prepared, model: Model, limits: ResponseLimits) -> _Known:
         problem, best = prepared.problem, model.chosen.fit
         size, dynamics = best.structure.size, best.dynamics
-        every = parameter_covariance(problem, problem.sensitivity(best), best.residual)
+        passed = replace(dynamics, numerator=best.gain * dynamics.numerator)
+        every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
         transform = best.scaled.coefficient_jacobian(best.shape)
         from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
         hidden = inter_sample_delay_bound(problem.motion, prepared.steps, problem.period)
