@@ -15,8 +15,9 @@ from omsm_ros.errors import ConfigurationError
 # The setting without which masses, springs and dampers are known only per mass of the table.
 TABLE_MASS_SETTING = "table_mass_kg"
 _LINES = 40
-# rms of the difference of response over its uncertainty: beyond this it is another machine.
-_GREATEST_MISFIT = 2.0
+# Root of χ² per degree of freedom, of which there are one or two: beyond this, which chance
+# exceeds three times in a thousand at most, it is another machine.
+_GREATEST_MISFIT = 3.0
 # A mass known worse than this, relative, is not known; its stated uncertainty is linearised.
 _GREATEST_UNCERTAINTY = 0.5
 
@@ -47,7 +48,7 @@ def two_mass_entry(
 
     Eq. 7 is tried first (the probe on the second mass), then the driven mass itself.
     """
-    if not up_to > 0 or len(oscillations(dynamics)) < 2 or dynamics.delay > 0:
+    if not up_to > 0 or len(oscillations(dynamics)) < 2:
         return None
     lines = np.linspace(up_to / _LINES, up_to, _LINES)
     for collocated in (False, True):

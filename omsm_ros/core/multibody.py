@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize
+from scipy import linalg, optimize
 
 from omsm_ros.core.confidence import relative_response_jacobian
 from omsm_ros.core.records import FloatArray
@@ -27,6 +27,8 @@ FITTED = ("m2", "k1", "k2", "c1", "c2")
 _LINES = 200
 # Natural logarithm of how far from its guess a mass or a spring may come out.
 _SEARCHED = 8.0
+# Of the stated uncertainty, where no coefficient could follow the model.
+_UNSTATED = 0.1
 # The six guesses race for this many steps; the best of them is followed to its end.
 _RACE_EVALUATIONS = 8
 
@@ -70,7 +72,8 @@ class TwoMass:
 @dataclass(frozen=True, eq=False)
 class TwoMassFit:
     """model: fitted;  uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
-    misfit: rms of the difference of response in units of its stated uncertainty
+    misfit: root of χ² per degree of freedom, of the response's difference over what is
+        stated of it; about 1 where the model is right
     """
 
     model: TwoMass
@@ -88,7 +91,8 @@ def fit_two_mass(
 ) -> TwoMassFit:
     """Masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
 
-    covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty
+    covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty; a delay
+        among them is one more thing that the model has to explain
     table_mass: m1 [kg], which no response can tell; 1 for all others relative to it
     frequencies: lines to compare at [Hz]
 
@@ -101,7 +105,8 @@ def fit_two_mass(
             f"the two-mass model needs two oscillating modes, the response has {len(oscillating)!r}"
         )
     target = np.log(dynamics.response(lines))
-    whiten = _whitener(dynamics, covariance, lines)
+    jacobian = _stacked_jacobian(dynamics, lines)
+    whiten = _whitener(jacobian, covariance)
 
     def model(logs: FloatArray) -> TwoMass:
         return TwoMass(table_mass, *(float(v) for v in np.exp(logs)))
@@ -111,7 +116,7 @@ def fit_two_mass(
         found = two.collocated() if collocated else two.non_collocated()
         difference = np.log(found.response(lines)) - target
         turned = np.angle(np.exp(1j * difference.imag))
-        return np.asarray(whiten * np.concatenate([difference.real, turned]))
+        return np.asarray(whiten @ np.concatenate([difference.real, turned]))
 
     def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
         box = (start - _SEARCHED, start + _SEARCHED)
@@ -121,13 +126,12 @@ def fit_two_mass(
 
     raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(oscillating, table_mass)]
     best = descend(min(raced, key=lambda found: float(found.cost)).x, None)
-    sensitivity = np.linalg.pinv(best.jac) * whiten
-    spread = sensitivity @ _stacked_jacobian(dynamics, lines)
+    spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
     variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
     return TwoMassFit(
         model(best.x),
         np.sqrt(np.maximum(variance, 0.0)),
-        float(np.sqrt(2 * best.cost / len(best.fun))),
+        float(np.sqrt(2 * best.cost / max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1))),
     )
 
 
@@ -135,11 +139,18 @@ def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArr
     return relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
 
 
-def _whitener(dynamics: TransferFunction, covariance: FloatArray, lines: FloatArray) -> FloatArray:
-    jacobian = _stacked_jacobian(dynamics, lines)
-    variance = np.einsum("kp,pq,kq->k", jacobian, covariance, jacobian)
+def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """W with Wᵀ W the inverse covariance of the response at all lines together, (k, k).
+
+    The response of a few coefficients is the same statement many times over. What it cannot
+    state at all, for it has no coefficient for it, counts ten times as much as its variance.
+    """
+    stated = jacobian @ covariance @ jacobian.T
+    variance = np.diag(stated)
     floor = 1e-6 * float(np.max(variance)) or 1.0
-    return np.asarray(1 / np.sqrt(np.maximum(variance, floor)))
+    further = _UNSTATED**2 * np.diag(np.maximum(variance, floor))
+    root = np.linalg.cholesky(stated + further)
+    return np.asarray(linalg.solve_triangular(root, np.eye(len(root)), lower=True))
 
 
 def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:

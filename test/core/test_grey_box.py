@@ -32,7 +32,7 @@ def calibrated(collocated, mass):
 def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
     entry = calibrated(collocated, 10.0).certificate["two_mass"]
     assert entry["collocated"] is collocated
-    assert entry["misfit"] < 2.0
+    assert entry["misfit"] < 3.0
     assert entry["model"]["m1"] == 10.0
     assert entry["table_mass_kg"] == 10.0
     for name in FITTED:
@@ -76,12 +76,18 @@ def test_what_is_not_two_masses_is_not_called_so():
     assert two_mass_entry(odd, covariance, 150.0, 10.0) is None
 
 
-def test_one_mode_or_a_delay_is_no_pair_of_masses():
+def test_one_mode_is_no_pair_of_masses():
     one = TransferFunction.from_ascending([1.0], [1.0, 1e-4, 1e-6])
     assert two_mass_entry(one, np.zeros((4, 4)), 100.0, 10.0) is None
+
+
+def test_masses_do_not_explain_a_latency():
     chain = MACHINE.non_collocated()
-    late = TransferFunction(chain.numerator, chain.denominator, 1e-4)
-    assert two_mass_entry(late, np.zeros((7, 7)), 100.0, 10.0) is None
+    late = TransferFunction(chain.numerator, chain.denominator, 5e-4)
+    recording = record(Cell(plant=Plant(late)), StepTest(), Flat(), stand_off=-49e-6)
+    found = identify(assemble([recording.axes], [recording.distance]))
+    assert found.certificate["verdict"] != "rejected"
+    assert found.certificate["two_mass"] is None
 
 
 def test_the_stated_uncertainty_is_the_scatter_of_repeated_fits():
