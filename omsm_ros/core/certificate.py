@@ -30,6 +30,8 @@ class Evidence:
     whiteness, independence: p-values of the residual's tests
     limits: of the 95 % band, within which the response is trusted up to ``valid_up_to``
     delay_noise, delay_uncertainty: of the low-frequency delay, from noise alone and in all
+    widened: factor on all uncertainties, for an order asked for that leaves things open
+    clearly_better: number of poles that the data ask for instead, or None
     """
 
     chi_square: float
@@ -44,6 +46,8 @@ class Evidence:
     delay_uncertainty: float
     inter_sample_delay_bound: float
     edges: int
+    widened: float = 1.0
+    clearly_better: int | None = None
 
 
 def certify(
@@ -103,8 +107,8 @@ def _reasons(evidence: Evidence) -> list[str]:
     if evidence.chi_square > _WORST_CHI_SQUARE:
         reasons.append(
             f"where the axis moves the residual is {evidence.chi_square:.2f} times the noise of "
-            f"{evidence.noise * 1e9:.3g} nm squared: the model misses something; check for "
-            "backlash, a loose mount or a clipped probe"
+            f"{evidence.noise * 1e9:.3g} nm squared: the model misses something; "
+            + _what_to_check(evidence)
         )
     if evidence.chi_square < _LEAST_CHI_SQUARE:
         reasons.append(
@@ -126,8 +130,18 @@ def _reasons(evidence: Evidence) -> list[str]:
     return reasons
 
 
+def _what_to_check(evidence: Evidence) -> str:
+    if evidence.clearly_better is not None:
+        return f"the order asked for is wrong, {evidence.clearly_better} poles tell far more"
+    return "check for backlash, a loose mount or a clipped probe"
+
+
 def _warnings(dynamics: TransferFunction, evidence: Evidence) -> list[str]:
-    return [
+    widened = [
+        f"the order was asked for; without asking, more stays open than it can state: its "
+        f"uncertainties are taken {evidence.widened:.2g} times as large"
+    ]
+    return widened[: evidence.widened > 1] + [
         f"pole at {mode.frequency:.0f} Hz lies beyond {evidence.valid_up_to:.0f} Hz, "
         "up to which the response is known within limits: it need not be a resonance"
         for mode in dynamics.modes()

@@ -10,7 +10,7 @@ from scipy import fft
 
 from omsm_ros.core.output_error import Problem
 from omsm_ros.core.records import FloatArray
-from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.units import DEGREE_RAD
 
 # 95 % of a normal distribution.
@@ -157,6 +157,19 @@ def response_band(
     variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
     gain, phase = np.sqrt(np.maximum(variance, 0.0))
     return Band(np.asarray(frequency, np.float64), gain, phase)
+
+
+def widening(band: Band, other: Band, apart: ComplexArray) -> float:
+    """Least factor, not below 1, by which ``band`` has to grow to hold the whole of ``other``.
+
+    apart: ln of the other's response over that of ``band``, at the same frequencies (k,)
+    """
+    parts = ((band.gain, other.gain, apart.real), (band.phase, other.phase, apart.imag))
+    factors = [
+        (np.abs(off) / COVERAGE_FACTOR + theirs)[own > 0] / own[own > 0]
+        for own, theirs, off in parts
+    ]
+    return float(np.max(np.concatenate([[1.0], *factors])))
 
 
 def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None) -> float:

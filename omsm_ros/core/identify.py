@@ -22,6 +22,7 @@ from omsm_ros.core.confidence import (
     parameter_covariance,
     response_band,
     trusted_up_to,
+    widening,
 )
 from omsm_ros.core.grey_box import table_mass, two_mass_entry
 from omsm_ros.core.hankel import HankelVote, hankel_vote
@@ -64,7 +65,7 @@ def identify(
 ) -> Calibration:
     """The calibration that ``record`` supports, with its covariance and certificate.
 
-    order: number of poles, 0 to choose it
+    order: number of poles, 0 to choose it; to ask for one makes nothing better known
     input: "encoder", or "reference" to take the second sensor as the motion
     free_dc_gain: report G_m(0) as found, with static_gain 1, instead of the two apart
     noise: known standard deviation of one reading of the probe [m], for χ²; None to take
@@ -81,6 +82,8 @@ def identify(
     prepared, model = _modelled(prepare(record, input), order)
     check_gain(model.chosen.fit.gain)
     known = _Known.of(prepared, model, limits)
+    if order:
+        known = _no_surer(known, prepared, model, limits)
     dynamics, covariance = model.chosen.fit.dynamics, known.covariance
     certificate = certify(
         dynamics,
@@ -150,6 +153,7 @@ class _Known:
     """How well the chosen model is known.
 
     covariance: of the coefficients, hidden motion included;  from_noise: without it
+    widened: factor on the uncertainties, and clearly_better: number of poles, see _no_surer
     """
 
     covariance: FloatArray
@@ -157,6 +161,8 @@ class _Known:
     gain_variance: float
     hidden_delay: float
     valid_up_to: float
+    widened: float = 1.0
+    clearly_better: int | None = None
 
     @classmethod
     def of(cls, prepared: Prepared, model: Model, limits: ResponseLimits) -> _Known:
@@ -172,6 +178,35 @@ class _Known:
         band = response_band(dynamics, covariance, _frequencies(problem))
         valid = trusted_up_to(band, limits, _disagreement(model, band))
         return cls(covariance, from_noise, float(every[size, size]), hidden, valid)
+
+
+def _no_surer(known: _Known, prepared: Prepared, model: Model, limits: ResponseLimits) -> _Known:
+    """What is known of an order that was asked for, no surer than without asking.
+
+    Too low an order has few parameters, so little noise in them, and a bias beyond what the
+    motion excites, which no residual shows. The free choice tells how much it leaves open.
+    """
+    free = choose_model(prepared)
+    mine, other = model.chosen.fit, free.chosen.fit
+    if mine.structure == other.structure or mine.structure.contains(other.structure):
+        return known
+    lines = _frequencies(prepared.problem)
+    trusted = lines[lines <= known.valid_up_to]
+    factor = widening(
+        response_band(mine.dynamics, known.covariance, trusted),
+        response_band(other.dynamics, _Known.of(prepared, free, limits).covariance, trusted),
+        np.log(other.dynamics.response(trusted) / mine.dynamics.response(trusted)),
+    )
+    covariance = factor**2 * known.covariance
+    band = response_band(mine.dynamics, covariance, lines)
+    better = free.chosen.bic < model.chosen.bic - _EQUALLY_GOOD_BIC
+    return replace(
+        known,
+        covariance=covariance,
+        valid_up_to=trusted_up_to(band, limits, _disagreement(model, band)),
+        widened=factor,
+        clearly_better=other.structure.poles if better else None,
+    )
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
@@ -205,6 +240,8 @@ def _evidence(
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),
         inter_sample_delay_bound=known.hidden_delay,
         edges=len(prepared.steps.edges),
+        widened=known.widened,
+        clearly_better=known.clearly_better,
     )
 
 

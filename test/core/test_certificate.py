@@ -66,6 +66,17 @@ def test_a_pole_beyond_the_trusted_band_is_warned_of():
     assert certificate(GOOD, SLOW)["warnings"] == []
 
 
+def test_a_wrong_order_asked_for_is_the_cause():
+    (text,) = certificate(replace(GOOD, chi_square=2.0, clearly_better=4))["reasons"]
+    assert "the order asked for is wrong, 4 poles" in text
+    assert "backlash" not in text
+
+
+def test_widened_uncertainties_are_warned_of():
+    (text,) = certificate(replace(GOOD, widened=6.3))["warnings"]
+    assert "6.3 times as large" in text
+
+
 def test_further_values_are_kept():
     assert certificate(GOOD)["polarity"] == 1
 

@@ -16,6 +16,7 @@ from omsm_ros.core.confidence import (
     relative_response_jacobian,
     response_band,
     trusted_up_to,
+    widening,
 )
 from omsm_ros.core.output_error import Problem
 from omsm_ros.core.transfer_function import TransferFunction
@@ -145,3 +146,18 @@ def test_a_known_disagreement_narrows_the_trust():
     quiet = Band(frequency, np.zeros(100), np.zeros(100))
     other = Band(frequency, 1e-3 * frequency, np.zeros(100))
     assert trusted_up_to(quiet, ResponseLimits(gain=0.02001), other) == 20
+
+
+def test_a_widened_band_just_holds_the_other():
+    lines = np.array([1.0, 10.0])
+    own = Band(lines, np.array([0.0, 1e-3]), np.array([1e-3, 2e-3]))
+    other = Band(lines, np.array([0.0, 2e-3]), np.array([1e-3, 2e-3]))
+    apart = np.array([0.0, 5e-3 - 1e-3j])
+    factor = widening(own, other, apart)
+    # The gain at 10 Hz asks for most: 5e-3 and twice its own uncertainty.
+    assert 1.96 * factor * 1e-3 == pytest.approx(5e-3 + 1.96 * 2e-3, rel=1e-3)
+
+
+def test_a_band_that_holds_the_other_is_not_narrowed():
+    wide, narrow = (Band(np.ones(1), np.full(1, u), np.full(1, u)) for u in (1e-2, 1e-3))
+    assert widening(wide, narrow, np.zeros(1, complex)) == 1.0
