@@ -1,0 +1,87 @@
+"""How far from the truth is what was identified, and is that as far as it is said to be?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.row import Row, between
+from omsm_ros.core.calibration import REJECTED, Calibration
+from omsm_ros.core.confidence import COVERAGE_FACTOR, response_band
+from omsm_ros.core.modes import known_modes
+from omsm_ros.core.multibody import FITTED, TwoMass
+from omsm_ros.core.records import BoolArray, FloatArray
+from omsm_ros.core.transfer_function import TransferFunction
+
+
+def mode_errors(
+    found: Sequence[Calibration], truth: TransferFunction, index: int
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Relative errors of frequency and damping of the nearest mode, each (runs,), and stated."""
+    mode, errors = truth.modes()[index], []
+    known = [
+        min(
+            known_modes(c.dynamics, c.covariance),
+            key=lambda m: abs(np.log(m.frequency / mode.frequency)),
+        )
+        for c in found
+    ]
+    for name in ("frequency", "damping"):
+        exact = getattr(mode, name)
+        values = np.array([getattr(m, name) for m in known])
+        stated = np.array([getattr(m, f"{name}_uncertainty") for m in known])
+        errors.append((values / exact - 1, stated / exact))
+    return errors
+
+
+def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: bool) -> FloatArray:
+    """Errors of m2, k1, k2, c1, c2 per m1 over stated, (runs where it was recognised, 5)."""
+    entries: list[Any] = [c.certificate["two_mass"] for c in found]
+    known = [e for e in entries if e is not None and e["collocated"] is collocated]
+    return np.array([_mass_errors(entry, truth) for entry in known]).reshape(-1, len(FITTED))
+
+
+def _mass_errors(entry: Mapping[str, Any], truth: TwoMass) -> list[float]:
+    model, stated = entry["model"], entry["relative_uncertainty"]
+    exact = {name: getattr(truth, name) / truth.m1 for name in FITTED}
+    return [float(np.log(model[n] / model["m1"] / exact[n]) / stated[n]) for n in FITTED]
+
+
+def worst(errors: tuple[FloatArray, FloatArray]) -> float:
+    """Greatest error, whatever is stated."""
+    return float(np.max(np.abs(errors[0])))
+
+
+def over_stated(errors: tuple[FloatArray, FloatArray]) -> float:
+    """Greatest error over its standard uncertainty."""
+    return float(np.max(np.abs(errors[0]) / errors[1]))
+
+
+def inside(name: str, found: Sequence[Calibration], off: FloatArray, stated: FloatArray) -> Row:
+    """Share of runs whose 95 % interval holds the truth, or that are rejected."""
+    share = np.mean((np.abs(off) < COVERAGE_FACTOR * stated) | rejected(found))
+    return between(f"inside 95 %: {name}", 100 * float(share), "%", 85, 100)
+
+
+def rejected(found: Sequence[Calibration]) -> BoolArray:
+    """By the certificate, (runs,)."""
+    return np.array([c.certificate["verdict"] == REJECTED for c in found])
+
+
+def band_held(found: Sequence[Calibration], truth: TransferFunction) -> float:
+    """Least share over frequency [%] of runs whose 95 % band holds the truth, or rejected."""
+    held = []
+    for calibration in found:
+        lines = calibration.valid_up_to * np.array([0.1, 0.3, 0.6, 0.9, 1.0])
+        band = response_band(calibration.dynamics, calibration.covariance, lines)
+        error = np.log(calibration.dynamics.response(lines) / truth.response(lines))
+        held.append(
+            [
+                np.abs(error.real) < COVERAGE_FACTOR * band.gain,
+                np.abs(error.imag) < COVERAGE_FACTOR * band.phase,
+            ]
+        )
+    every = np.array(held) | rejected(found)[:, np.newaxis, np.newaxis]
+    return 100 * float(np.min(np.mean(every, axis=0)))
