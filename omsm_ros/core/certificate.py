@@ -138,8 +138,8 @@ def _what_to_check(evidence: Evidence) -> str:
 
 def _warnings(dynamics: TransferFunction, evidence: Evidence) -> list[str]:
     widened = [
-        f"the order was asked for; without asking, more stays open than it can state: its "
-        f"uncertainties are taken {evidence.widened:.2g} times as large"
+        f"order {len(dynamics.denominator) - 1} was asked for; without asking, more stays open "
+        f"than it can state: its uncertainties are taken {evidence.widened:.2g} times as large"
     ]
     return widened[: evidence.widened > 1] + [
         f"pole at {mode.frequency:.0f} Hz lies beyond {evidence.valid_up_to:.0f} Hz, "

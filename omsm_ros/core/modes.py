@@ -94,17 +94,19 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
 
 
-def modal_remainder(dynamics: TransferFunction, up_to: float) -> float:
-    """Greatest ``|G - Eq. 8|`` below ``up_to`` [Hz], over G(0): what the terms alone leave.
+def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
+    """Greatest ``|G - Eq. 8|`` over greatest ``|G|``, below ``up_to`` [Hz]; a delay left out.
 
-    Real poles and the parts in s. 1 where nothing oscillates; a delay does not count.
+    What the terms do not say: real poles and the parts in s. None where nothing oscillates.
     """
     size = len(dynamics.numerator) + len(dynamics.denominator)
     modes = known_modes(dynamics, np.zeros((size, size)))
     terms = [term for term in (mode.term() for mode in modes) if term is not None]
+    if not terms:
+        return None
     lines = np.linspace(0.0, up_to, _LINES)
     whole = replace(dynamics, delay=0.0).normalised().response(lines)
-    return float(np.max(np.abs(whole - modal_sum(terms, lines))))
+    return float(np.max(np.abs(whole - modal_sum(terms, lines))) / np.max(np.abs(whole)))
 
 
 def _known(dynamics: TransferFunction, pole: complex, covariance: FloatArray) -> KnownMode:

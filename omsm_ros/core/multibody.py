@@ -10,12 +10,11 @@ together, so one of them has to be known, ``m1``, or taken as the unit of the ot
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, optimize
+from scipy import linalg, optimize, signal
 
 from omsm_ros.core.confidence import relative_response_jacobian
 from omsm_ros.core.records import FloatArray
@@ -27,6 +26,8 @@ FITTED = ("m2", "k1", "k2", "c1", "c2")
 _LINES = 200
 # Natural logarithm of how far from its guess a mass or a spring may come out.
 _SEARCHED = 8.0
+# In ln of the gain: less is rounding.
+_LEAST_PROMINENCE = 1e-6
 # Of the stated uncertainty, where no coefficient could follow the model.
 _UNSTATED = 0.1
 # The six guesses race for this many steps; the best of them is followed to its end.
@@ -175,7 +176,7 @@ def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArra
 class Shape:
     """What a response looks like; Hz, NaN where it has no such point below ``up_to``.
 
-    resonance: of the greatest gain, and that gain;  minimum: of the least gain, and that gain
+    resonance: of the highest peak of the gain, and that gain;  minimum: of the lowest dip
     bandwidth_3db: where the gain first leaves 1 by 3 dB;  bandwidth_1_percent: by 1 %
     """
 
@@ -191,7 +192,7 @@ def shape(dynamics: TransferFunction, up_to: float) -> Shape:
     """Read the salient points of |G| below ``up_to`` [Hz]."""
     frequency = np.geomspace(1e-3 * up_to, up_to, 20 * _LINES)
     gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
-    highest, lowest = _interior(gain, np.argmax), _interior(gain, np.argmin)
+    highest, lowest = _highest_peak(np.log(gain)), _highest_peak(-np.log(gain))
 
     def point(index: int | None) -> tuple[float, float]:
         if index is None:
@@ -212,7 +213,7 @@ def finite_values(read: Shape) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
 
 
-def _interior(gain: FloatArray, pick: Callable[[FloatArray], np.intp]) -> int | None:
-    """The extreme's place, or None at an end, where it is no extreme."""
-    index = int(pick(gain))
-    return index if 0 < index < len(gain) - 1 else None
+def _highest_peak(values: FloatArray) -> int | None:
+    """Its place, None where there is none; at an end there is no peak."""
+    peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
+    return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -57,6 +57,8 @@ def two_mass_table(certificate: Certificate) -> Table:
         value = number(part(model, name))
         relative = number(part(certificate, "two_mass", "relative_uncertainty", name))
         text = NOTHING if value is None else measured(value, (relative or 0.0) * value, unit)
+        if name == "m1" and value is not None:
+            text += ", as given"
         rows.append((name if absolute else f"{name} / m1", text))
     side = part(certificate, "two_mass", "collocated")
     rows += [
@@ -70,8 +72,8 @@ def two_mass_table(certificate: Certificate) -> Table:
 _SHAPE_ROWS = (
     ("gain off 1 by 1 %", "bandwidth_1_percent", None),
     ("gain off 1 by 3 dB", "bandwidth_3db", None),
-    ("greatest gain", "resonance", "resonance_gain"),
-    ("least gain", "minimum", "minimum_gain"),
+    ("highest peak of the gain", "resonance", "resonance_gain"),
+    ("lowest dip of the gain", "minimum", "minimum_gain"),
 )
 
 
@@ -84,8 +86,9 @@ def shape_table(calibration: Calibration) -> Table:
     ]
     left = number(certificate.get("modal_remainder"))
     if left is not None:
-        name = "|G − Σ residue terms|, at most"
-        rows.append((name, f"{plain(100 * left)} %", f"up to {quantity(trusted, 'Hz')}"))
+        rows.append(
+            ("not in the terms of Eq. 8, of the greatest gain", f"{plain(100 * left, 2)} %", "yes")
+        )
     columns = ("", "within the trusted band")
     return Table("Shape of the response", columns, known_rows(rows, 1))
 

@@ -98,3 +98,12 @@ def test_below_nyquist_eq_12_has_no_resonance():
     values = finite_values(shape(PAPER_EQ_12.normalised(), 500.0))
     assert values["resonance"] is None
     assert values["minimum"] == pytest.approx(347, abs=3)
+
+
+def test_the_dip_of_a_driven_mass_is_where_the_other_absorbs():
+    """However far the gain falls beyond the modes."""
+    light = TwoMass(m1=10.0, m2=2.0, k1=8e6, k2=1.6e6, c1=900.0, c2=6.0)
+    read = shape(light.collocated(), 500.0)
+    assert read.minimum == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
+    modes = light.collocated().modes()
+    assert read.resonance == pytest.approx(modes[0].frequency, rel=0.01)
