@@ -55,9 +55,67 @@ def test_the_order_is_chosen_near_the_truth():
     assert np.std((held.output - seen)[~halves(600)]) < 0.03
 
 
+def integrating_system(samples, noise, seed):
+    """Ball on a beam: position from angle through two integrators, held near 0 by a hand.
+
+    Its free run amplifies any error of the initial velocity by the length of the run.
+    """
+    rng = np.random.default_rng(seed)
+    period, position, speed = 0.1, 0.0, 0.0
+    command, seen = np.empty(samples), np.empty(samples)
+    wanted = signal.lfilter([0.02], [1, -0.98], rng.normal(0, 1, samples))
+    for k in range(samples):
+        seen[k] = position
+        command[k] = 0.25 * (wanted[k] - position) - 0.35 * speed
+        position += period * speed + 0.5 * period**2 * 7 * command[k]
+        speed += period * 7 * command[k]
+    return command, seen + noise * np.std(seen) * rng.normal(size=samples)
+
+
+@pytest.mark.parametrize("order", [2, 6])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_poles_to_spare_do_not_let_an_integrating_plant_drift_away(order, seed):
+    command, seen = integrating_system(600, 0.02, seed)
+    used = halves(600)
+    held = identify_held(command, seen, used, 0.1, order=order)
+    assert 2 <= held.order <= order
+    assert np.var((seen - held.output)[~used]) < 0.1 * np.var(seen[~used])
+
+
+def test_more_poles_than_can_be_known_predict_as_well_as_enough():
+    command, seen = held_system(noise=0.3)
+    rest = ~halves(600)
+    enough, many = (
+        np.std((identify_held(command, seen, ~rest, 0.1, order=order).output - seen)[rest])
+        for order in (2, 8)
+    )
+    assert many < 1.01 * enough
+
+
+def test_what_no_model_predicts_is_given_none():
+    rng = np.random.default_rng(5)
+    command, seen = rng.normal(size=400), np.cumsum(rng.normal(size=400))
+    held = identify_held(command, seen, halves(400), 1.0, delays=range(3))
+    assert held.order == 0
+
+
+def test_a_gap_is_bridged():
+    command, seen = held_system(noise=0.02)
+    used = (np.arange(600) < 200) | (np.arange(600) >= 300)
+    broken = np.where(used, seen, np.nan)
+    held = identify_held(command, broken, used, 0.1, order=3)
+    assert np.std((held.output - seen)[~used]) < 0.03
+
+
+def test_the_fewest_samples_that_suffice_are_taken():
+    command, seen = held_system(samples=400)
+    held = identify_held(command, seen, np.arange(400) < 20, 0.1, order=2)
+    assert np.all(np.isfinite(held.output))
+
+
 def test_too_few_samples_are_refused():
-    with pytest.raises(IdentificationError, match="samples are used"):
-        identify_held(np.zeros(20), np.zeros(20), np.ones(20, bool), 1.0)
+    with pytest.raises(IdentificationError, match="19 samples are used, at least 20"):
+        identify_held(np.zeros(19), np.zeros(19), np.ones(19, bool), 1.0, order=2)
 
 
 def test_what_is_not_finite_is_refused():
