@@ -53,6 +53,9 @@ def response_with_band(calibration: Calibration, seen: FrequencyResponse | None 
 def _draw_points(gain: Axes, phase: Axes, seen: FrequencyResponse) -> None:
     size, spread = np.abs(seen.response), COVERAGE_FACTOR * seen.uncertainty
     angle = np.angle(seen.response) / DEGREE_RAD
+    # An angle is known to a whole turn only: on that of the curve.
+    curve = np.interp(seen.frequency, *phase.get_lines()[0].get_data())
+    angle += 360.0 * np.round((curve - angle) / 360.0)
     look: dict[str, Any] = {
         "fmt": "o", "markersize": 2.6, "color": style.BEFORE, "elinewidth": 0.8, "alpha": 0.8,
     }  # fmt: skip

@@ -373,6 +373,19 @@ class TestFigures:
         labels = {text.get_text() for text in gain.get_legend().get_texts()}
         assert labels == {"95 % band", "identified", "without a model, 95 %"}
 
+    def test_a_phase_beyond_half_a_turn_lies_on_the_curve(self, calibration):
+        late = replace(
+            calibration,
+            dynamics=TransferFunction([1.0], [1.0], 10e-3),
+            covariance=np.zeros((2, 2)),
+        )
+        frequency = np.array([5.0, 60.0, 130.0, 210.0])
+        exact = np.full(4, 1e-4)
+        seen = FrequencyResponse(frequency, late.dynamics.response(frequency), np.ones(4), exact)
+        phase = certificate_figures.response_with_band(late, seen).get_axes()[1]
+        points = phase.containers[0].lines[0]
+        np.testing.assert_allclose(points.get_ydata(), -360.0 * frequency * 10e-3, atol=1e-6)
+
     def test_the_end_of_trust_is_written(self, calibration):
         def notes(valid):
             shown = replace(calibration, valid_up_to=valid)
