@@ -83,7 +83,8 @@ class HeldProblem(Problem):
 @dataclass(frozen=True, eq=False)
 class HeldFit:
     """order: poles;  delay: whole samples;  whitened: fitted with its residual made white
-    output: what the model says is seen (n,), a free run from its initial state
+    output: what the model says is seen (n,), a free run from its initial state; the first
+        ``delay`` samples mean nothing, for what they answer to was before the record
     """
 
     order: int
