@@ -16,8 +16,10 @@ from omsm_ros.units import DEGREE_RAD
 # 95 % of a normal distribution.
 COVERAGE_FACTOR = 1.959964
 _MAX_NOISE_ORDER = 12
+# Octaves from one trial frequency to the next.
+_SHOWN_STEP = 1 / 24
 # Directions of the parameter space this much weaker than the strongest are left out.
-_RANK_TOLERANCE = 1e-13
+_RANK_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,3 +186,23 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
     if len(outside) == 0:
         return float(band.frequency[-1])
     return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
+
+
+def shown_up_to(
+    frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
+) -> float:
+    """Highest frequency [Hz] at which the data alone would show a response off by ``limits``.
+
+    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
+    noise: mean square of the transform of the probe's noise, (k,)
+    A model extrapolates beyond it, and what it misses there shows in no residual. Taken
+    over a third of an octave: a deviation δ of G adds δ · answer, so its best estimate has
+    the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    """
+    power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
+    for centre in frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP)):
+        near = np.abs(np.log2(np.maximum(frequency, 1e-3 * centre) / centre)) <= 1 / 6
+        energy = float(np.sum(power[near]))
+        if energy * allowed > np.sqrt(0.5 * float(power[near] @ noise[near])):
+            return float(centre)
+    return 0.0

@@ -79,7 +79,8 @@ def explain(record: MotionRecord, calibration: Calibration, source: str = "encod
 def _through(dynamics: TransferFunction, problem: Problem) -> FloatArray:
     """G_m applied to the motion as the fit applies it: by its spectrum, closed to a period."""
     closed = close_period(problem.motion, problem.period)
-    spectrum = denoised(np.asarray(fft.rfft(closed), np.complex128), len(closed) * problem.noise**2)
+    noise_power = len(problem.motion) * problem.noise**2
+    spectrum = denoised(np.asarray(fft.rfft(closed), np.complex128), noise_power)
     frequency = fft.rfftfreq(len(closed), problem.period)[: len(spectrum)]
     answered = fft.irfft(spectrum * dynamics.response(frequency), len(closed))
     return np.asarray(answered[: len(problem.motion)], np.float64)

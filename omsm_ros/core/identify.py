@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from scipy import fft, signal
 
 from omsm_ros.core.calibration import Calibration
 from omsm_ros.core.certificate import Evidence, certify
@@ -19,8 +20,10 @@ from omsm_ros.core.confidence import (
     Band,
     ResponseLimits,
     hidden_motion_covariance,
+    noise_spectrum,
     parameter_covariance,
     response_band,
+    shown_up_to,
     trusted_up_to,
     widening,
 )
@@ -51,6 +54,7 @@ _EQUALLY_GOOD_BIC = 10.0
 # A delay's uncertainty is read off the phase far below everything that moves.
 _LOW_FREQUENCY_HZ = 1e-3
 _AGREEMENT_SEGMENT_S = 1.0
+_LEAST_SEGMENTS = 8
 
 
 def identify(
@@ -142,7 +146,8 @@ def _modelled(prepared: Prepared, order: int) -> tuple[Prepared, Model]:
     """The model, with free decays in the problem where something still rang at its start."""
     model = choose_model(prepared, order)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
-    if not still_decays(prepared.problem, model.chosen.fit, colour):
+    at_rest = not prepared.steps.moving[0]
+    if not still_decays(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
         return prepared, model
     prepared = replace(prepared, problem=replace(prepared.problem, starts_moving=True))
     return prepared, choose_model(prepared, order)
@@ -153,6 +158,7 @@ class _Known:
     """How well the chosen model is known.
 
     covariance: of the coefficients, hidden motion included;  from_noise: without it
+    shown_up_to: [Hz] beyond which the motion would show no error of the response
     widened: factor on the uncertainties, and clearly_better: number of poles, see _no_surer
     """
 
@@ -160,6 +166,7 @@ class _Known:
     from_noise: FloatArray
     gain_variance: float
     hidden_delay: float
+    shown_up_to: float
     valid_up_to: float
     widened: float = 1.0
     clearly_better: int | None = None
@@ -176,8 +183,9 @@ class _Known:
         further = hidden_motion_covariance(dynamics, hidden, problem.period)
         covariance = _symmetric(from_noise + further)
         band = response_band(dynamics, covariance, _frequencies(problem))
-        valid = trusted_up_to(band, limits, _disagreement(model, band))
-        return cls(covariance, from_noise, float(every[size, size]), hidden, valid)
+        shown = _shown_up_to(problem, best, limits)
+        valid = min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
+        return cls(covariance, from_noise, float(every[size, size]), hidden, shown, valid)
 
 
 def _no_surer(known: _Known, prepared: Prepared, model: Model, limits: ResponseLimits) -> _Known:
@@ -203,9 +211,27 @@ def _no_surer(known: _Known, prepared: Prepared, model: Model, limits: ResponseL
     return replace(
         known,
         covariance=covariance,
-        valid_up_to=trusted_up_to(band, limits, _disagreement(model, band)),
+        valid_up_to=min(trusted_up_to(band, limits, _disagreement(model, band)), known.shown_up_to),
         widened=factor,
         clearly_better=other.structure.poles if better else None,
+    )
+
+
+def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
+    """Beyond this frequency [Hz] the data could not contradict the model ``best``."""
+    length = len(problem.used)
+    compared = np.flatnonzero(problem.used)
+    taper = np.zeros(length)
+    # From one end of what is compared to the other, so that no end breaks off.
+    taper[compared[0] : compared[-1] + 1] = signal.windows.hann(compared[-1] + 1 - compared[0])
+    answer = problem.output(best) - problem.background @ best.background
+    seen = best.samples / (compared[-1] + 1 - compared[0])
+    noise = noise_spectrum(best.residual, length) * float(taper @ taper) / seen
+    return shown_up_to(
+        np.asarray(fft.rfftfreq(length, problem.period)),
+        np.asarray(fft.rfft(taper * (answer - np.mean(answer))), np.complex128),
+        noise,
+        limits,
     )
 
 
@@ -261,7 +287,7 @@ def _further(
         "modes": mode_entries(best.dynamics, known.covariance),
         "modal_remainder": modal_remainder(best.dynamics, known.valid_up_to),
         "static_gains": _attributed(record),
-        "nonparametric_agreement": _agreement(prepared, best, known.valid_up_to),
+        "nonparametric_agreement": _agreement(prepared.problem, best, known.valid_up_to),
         "samples": dict(record.counts) | {"spikes": prepared.spikes, "compared": best.samples},
     }
 
@@ -274,13 +300,14 @@ def _attributed(record: MotionRecord) -> dict[str, object] | None:
         return None
 
 
-def _agreement(prepared: Prepared, best: Fit, up_to: float) -> float | None:
-    problem = prepared.problem
-    modelled = problem.output(best)
-    seen = np.where(problem.used, problem.seen, modelled) - problem.background @ best.background
-    segment = max(round(_AGREEMENT_SEGMENT_S / problem.period), 16)
-    measured = frequency_response(problem.motion, seen, problem.period, segment)
-    value = response_agreement(best.dynamics, measured, up_to, best.gain)
+def _agreement(problem: Problem, best: Fit, up_to: float) -> float | None:
+    left = np.zeros(len(problem.used))
+    left[problem.used] = best.residual
+    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(left) // _LEAST_SEGMENTS)
+    segment = max(segment, 16)
+    value = response_agreement(
+        frequency_response(problem.motion, left, problem.period, segment), up_to
+    )
     return value if np.isfinite(value) else None
 
 

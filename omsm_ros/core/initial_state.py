@@ -20,9 +20,12 @@ _OVER = 10.0
 _SPANNED = 1e-6
 
 
-def still_decays(problem: Problem, fitted: Fit, colour: float = 1.0) -> bool:
-    """True if the residual of ``fitted`` clearly holds free decays of its poles.
+def still_decays(
+    problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
+) -> bool:
+    """True if free decays of the poles of ``fitted`` reach into the samples that count.
 
+    at_rest: the axis is, at the start; then they have to show clearly in the residual
     colour: power of the noise at low frequency over its mean, by which chance explains more
     """
     counted = np.flatnonzero(problem.used)
@@ -31,8 +34,11 @@ def still_decays(problem: Problem, fitted: Fit, colour: float = 1.0) -> bool:
     first = float(counted[0]) * problem.period
     if float(np.min(-fitted.dynamics.poles().real)) * first > _OVER:
         return False
+    if not at_rest:
+        return True
     columns = problem.free_decays(fitted)[problem.used]
-    known = problem.background[problem.used]
+    # The fit has already taken of a decay what the parameters of the model can imitate.
+    known = problem.sensitivity(fitted)
     basis = _orthonormal(np.column_stack([columns, known]))
     explained = float(np.sum((basis.T @ fitted.residual) ** 2))
     rest = fitted.sum_of_squares - explained

@@ -26,6 +26,8 @@ from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 # Long enough that a bridge across the whole travel adds nothing near the fastest motion.
 _BRIDGE_S = 0.3
 _MIN_BRIDGE_SAMPLES = 64
+# In it a light mode rings down.
+_REST_S = 1.0
 _RANK_TOLERANCE = 1e-12
 _SMOOTHING_BINS = 101
 _RACE_EVALUATIONS = 5
@@ -40,10 +42,13 @@ _PULSE_END = 14.0
 
 
 def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """``motion`` (n,) and a smooth way back to its start, of a length quick to transform."""
+    """``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
+
+    On the way back it rests, until nothing rings when the record starts anew.
+    """
     bridge = max(round(_BRIDGE_S / period), _MIN_BRIDGE_SAMPLES)
-    total = fft.next_fast_len(len(motion) + bridge, real=True)
-    phase = np.arange(1, total - len(motion) + 1) / (total - len(motion) + 1)
+    total = fft.next_fast_len(len(motion) + bridge + round(_REST_S / period), real=True)
+    phase = np.arange(1, total - len(motion) + 1) / bridge
     way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
     return np.concatenate([motion, way_back])
 
@@ -98,7 +103,7 @@ class Problem:
     @cached_property
     def _spectrum(self) -> ComplexArray:
         raw = np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
-        moved = denoised(raw, self.closed_length * self.noise**2)
+        moved = denoised(raw, len(self.motion) * self.noise**2)
         # A decay may be faster than anything in the motion: then the whole band is needed.
         return np.pad(moved, (0, len(raw) - len(moved))) if self.starts_moving else moved
 

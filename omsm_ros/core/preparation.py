@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import signal
 
 from omsm_ros.core.motion_record import MotionRecord
 from omsm_ros.core.output_error import Problem, fit
@@ -28,6 +29,9 @@ from omsm_ros.units import MICROMETRE_M
 _SETTLING_S = 50e-3
 # Interpolation between samples needs neighbours on both sides.
 _EDGE_GUARD = 8
+# In this time a moving end is faded; the shape keeps its content within 4 / time, to 1e-6.
+_FADE_S = 0.5
+_FADE_SHAPE = 12.0
 _SPIKE_SIGMAS = 6.0
 # A probe is linear to a few per cent; beyond this a unit or a target is wrong.
 _PLAUSIBLE_GAIN = (0.5, 2.0)
@@ -57,7 +61,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     check_usable(record)
     motion = _motion(record, source)
     steps = _seen_whole(find_steps(motion, record.sample_period), record)
-    problem = _problem(record, motion, steps.noise)
+    problem = _problem(record, motion, steps)
     check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
@@ -81,22 +85,43 @@ def _motion(record: MotionRecord, source: str) -> FloatArray:
     return np.asarray(np.interp(index, index[known], record.reference[known]))
 
 
-def _problem(record: MotionRecord, motion: FloatArray, noise: float) -> Problem:
+def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     samples = len(record)
     used = record.ok & ~_after_loss(record)
     used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
+    carried = _from_rest_to_rest(motion, steps.moving, record.sample_period)
+    used &= carried == motion
     seen = np.where(record.ok, record.distance, 0.0)
     ramp = np.linspace(-1.0, 1.0, samples)
     return Problem(
-        motion=motion - np.mean(motion),
+        motion=carried - np.mean(motion),
         seen=seen - np.mean(seen[used]),
         used=used,
         period=record.sample_period,
         background=np.column_stack([np.ones(samples), ramp]),
         rate=2 * np.pi * content_frequency(motion, record.sample_period),
-        noise=noise,
+        noise=steps.noise,
     )
+
+
+def _from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
+    """``motion`` (n,), where it starts or ends moving faded to its mean there.
+
+    A motion that breaks off would have content at all frequencies, where there was none.
+    """
+    length = min(round(_FADE_S / period), len(motion) // 5)
+    rising = np.cumsum(signal.windows.kaiser(length, _FADE_SHAPE))
+    rising = rising / rising[-1]
+    carried = motion.copy()
+    for moves, end, weight in (
+        (moving[0], slice(0, length), rising),
+        (moving[-1], slice(len(motion) - length, None), rising[::-1]),
+    ):
+        if moves:
+            level = np.mean(motion[end])
+            carried[end] = level + weight * (motion[end] - level)
+    return carried
 
 
 def _after_loss(record: MotionRecord) -> BoolArray:

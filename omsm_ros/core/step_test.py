@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy import special
 
 from omsm_ros.core.motion_record import MotionRecord
 from omsm_ros.core.records import BoolArray, FloatArray
@@ -23,6 +24,7 @@ _GREATEST_TRAVEL_M = 20e-3
 # Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
 _NOISE_FACTOR = 20.0
 _TRAVEL_PART = 2e-3
+_DIFFERENCES = (2, 4, 6, 8)
 # Rest is the axis staying put for this long, and an edge ends when it begins.
 _REST_S = 20e-3
 
@@ -52,15 +54,19 @@ class Steps:
 
 
 def sample_noise(values: FloatArray) -> float:
-    """Standard deviation of white noise on a slow signal, from its second differences.
+    """Standard deviation of white noise on a smooth signal, from its differences.
 
-    A median, so that the few samples at the edges do not count.
+    Motion makes any of them too large, the lowest most; the smallest is the noise. A median,
+    so that the few samples at the edges do not count.
     """
-    if len(values) < 3:
-        return 0.0
-    second = np.abs(np.diff(values, 2))
-    # MAD of a normal distribution is 0.6745 σ; second differences have variance 6 σ².
-    return float(np.median(second) / 0.6745 / np.sqrt(6.0))
+    orders = [order for order in _DIFFERENCES if order < len(values)]
+    return min((_difference_noise(values, order) for order in orders), default=0.0)
+
+
+def _difference_noise(values: FloatArray, order: int) -> float:
+    # MAD of a normal distribution is 0.6745 σ; k-th differences have variance C(2k, k) σ².
+    middle = float(np.median(np.abs(np.diff(values, order))))
+    return middle / 0.6745 / float(np.sqrt(special.comb(2 * order, order)))
 
 
 def find_steps(z: FloatArray, sample_period: float) -> Steps:

@@ -17,7 +17,6 @@ from omsm_ros.core.output_error import Fit, Problem
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.spectrum import FrequencyResponse
 from omsm_ros.core.step_test import Steps
-from omsm_ros.core.transfer_function import TransferFunction
 
 _LAGS = 25
 # After an edge the response is looked at for this long.
@@ -168,17 +167,16 @@ def _lag(ahead: FloatArray, behind: FloatArray) -> FloatArray:
     return np.asarray(np.angle(ratio))
 
 
-def response_agreement(
-    dynamics: TransferFunction, measured: FrequencyResponse, up_to: float, gain: float
-) -> float:
-    """Mean square of (measured / gain - G) over its uncertainty, up to ``up_to`` [Hz]; about 1.
+def response_agreement(left: FrequencyResponse, up_to: float) -> float:
+    """Mean square difference of two responses over its uncertainty, 0 to ``up_to`` [Hz]; about 1.
 
-    Lines without coherence count for nothing.
+    left: response, without a model, of what a model leaves of what was seen. That is the
+        response of what was seen less that of what was modelled, both through the same
+        windows: what these leak of a light mode is in both, and cancels.
+    NaN where there is no line.
     """
-    good = (measured.frequency > 0) & (measured.frequency <= up_to) & (measured.coherence > 0.5)
-    if not np.any(good):
+    lines = (left.frequency > 0) & (left.frequency <= up_to)
+    if not np.any(lines):
         return float("nan")
-    g = dynamics.response(measured.frequency[good])
-    difference = np.abs(measured.response[good] / gain - g) / np.abs(g)
-    floor = np.maximum(measured.uncertainty[good], 1e-9)
-    return float(np.mean((difference / floor) ** 2) / 2)
+    # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
+    return float(np.mean(0.5 / left.uncertainty[lines] ** 2))

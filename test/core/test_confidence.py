@@ -7,6 +7,7 @@ import pytest
 from scipy import signal
 
 from omsm_ros.core.confidence import (
+    COVERAGE_FACTOR,
     Band,
     ResponseLimits,
     autoregression,
@@ -15,6 +16,7 @@ from omsm_ros.core.confidence import (
     parameter_covariance,
     relative_response_jacobian,
     response_band,
+    shown_up_to,
     trusted_up_to,
     widening,
 )
@@ -161,3 +163,36 @@ def test_a_widened_band_just_holds_the_other():
 def test_a_band_that_holds_the_other_is_not_narrowed():
     wide, narrow = (Band(np.ones(1), np.full(1, u), np.full(1, u)) for u in (1e-2, 1e-3))
     assert widening(wide, narrow, np.zeros(1, complex)) == 1.0
+
+
+@pytest.mark.parametrize(("noise", "expected"), [(1e-8, 40.0), (3e-4, 0.0)])
+def test_a_motion_shows_the_response_as_far_as_it_goes(noise, expected):
+    """m lines of power a² at noise s know gain and phase to √(s / 2 m a²): here to 3e-5 or 5e-3."""
+    frequency = np.arange(501.0)
+    answer = np.where(frequency <= 40, 1.0, 0.0).astype(complex)
+    found = shown_up_to(frequency, answer, np.full(501, noise), ResponseLimits())
+    # The band of a third of an octave still reaches down to 40 Hz from 45 Hz.
+    assert expected <= found <= expected * 2 ** (1 / 6)
+
+
+def test_the_deviation_that_shows_is_that_of_a_fit():
+    """The threshold, found by least squares for a deviation of G over simulated noise."""
+    frequency, centre = np.arange(501.0), 100.0
+    near = np.abs(np.log2(np.maximum(frequency, 1e-9) / centre)) <= 1 / 6
+    answer = np.where(near, 1.0 + 0.5j, 0.0)
+    random = np.random.default_rng(4)
+    shape = (4000, 501)
+    noise = (random.normal(size=shape) + 1j * random.normal(size=shape)) / np.sqrt(2)
+    fitted = (noise @ np.conj(answer)) / np.sum(np.abs(answer) ** 2)
+    spread = COVERAGE_FACTOR * np.std(fitted.real)
+    for factor, shown in ((1.1, True), (0.9, False)):
+        limits = ResponseLimits(gain=factor * spread, phase=1.0)
+        at_centre = np.where(np.arange(501) <= 112, answer, 0.0)
+        found = shown_up_to(frequency, at_centre, np.ones(501), limits)
+        assert (found > 95.0) is shown
+
+
+def test_without_motion_nothing_is_shown():
+    assert (
+        shown_up_to(np.arange(10.0), np.zeros(10, complex), np.zeros(10), ResponseLimits()) == 0.0
+    )

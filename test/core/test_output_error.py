@@ -125,6 +125,14 @@ def test_the_period_closes_without_a_jump():
     np.testing.assert_array_equal(closed[:1000], motion)
 
 
+def test_before_it_starts_anew_the_period_rests():
+    """Longer than a mode of 60 Hz and 2 % takes to lose all but a thousandth."""
+    motion = np.linspace(0.0, 1.0, 1000)
+    closed = close_period(motion, 1e-3)
+    assert np.log(1000) / (0.02 * 2 * np.pi * 60) < 1.0
+    np.testing.assert_array_equal(closed[-1000:], motion[0])
+
+
 def test_noise_is_taken_out_of_the_motion_and_motion_is_not():
     rng = np.random.default_rng(5)
     motion = smooth_motion()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.motion_record import MotionRecord
+from omsm_ros.core.output_error import close_period
 from omsm_ros.core.preparation import content_frequency, prepare
 from omsm_ros.core.trajectory import StepTest
 from omsm_ros.errors import IdentificationError
@@ -76,3 +77,30 @@ def test_content_frequency_is_that_of_the_motion():
     time = np.arange(10_000) * 1e-3
     assert content_frequency(np.sin(2 * np.pi * 7 * time), 1e-3) == pytest.approx(7.0, abs=0.3)
     assert content_frequency(STEPS, 1e-3) > 30
+
+
+def test_a_motion_that_breaks_off_ends_at_rest_and_without_new_content():
+    frequency, period, samples = 10.3, 1e-3, 20_000
+    z = 20e-6 * np.sin(2 * np.pi * frequency * period * np.arange(samples) + 0.3)
+    distance = np.random.default_rng(1).normal(-z, 1e-8)
+    problem = prepare(MotionRecord.from_arrays(period, z, distance), "encoder").problem
+    assert not np.any(problem.used[:499])
+    assert not np.any(problem.used[-499:])
+    assert np.mean(problem.used) > 0.94
+
+    def beyond(motion):
+        closed = close_period(motion, period)
+        spectrum = np.abs(np.fft.rfft(closed))
+        lines = np.fft.rfftfreq(len(closed), period) > frequency + 10.0
+        return np.max(spectrum[lines]) / np.max(spectrum)
+
+    assert beyond(problem.motion) < 1e-5
+    assert beyond(z) > 1e-4
+
+
+def test_what_rests_at_both_ends_is_left_as_it_is():
+    recorded = record_of()
+    problem = prepare(recorded, "encoder").problem
+    np.testing.assert_allclose(np.diff(problem.motion), np.diff(recorded.z), atol=1e-18)
+    assert problem.used[60]
+    assert problem.used[-10]

@@ -60,6 +60,15 @@ def test_noise_is_that_of_one_sample_even_with_steps():
     assert sample_noise(z) == pytest.approx(3e-9, rel=0.1)
 
 
+@pytest.mark.parametrize("frequency", [2.0, 15.0, 50.0])
+def test_a_motion_that_never_rests_is_not_noise(frequency):
+    time = np.arange(20_000) * 1e-3
+    z = 20e-6 * np.sin(2 * np.pi * frequency * time) + np.random.default_rng(2).normal(
+        0, 3e-9, 20_000
+    )
+    assert sample_noise(z) == pytest.approx(3e-9, rel=0.1)
+
+
 def test_a_motion_at_rest_has_no_steps():
     rest = np.random.default_rng(3).normal(0, 0.4e-9, 20_000)
     with pytest.raises(StepTestError, match="no steps"):
