@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.row import Row
 
-PARTS = ("identification", "correction", "offline", "live", "real_data")
+PARTS = ("identification", "free_path", "correction", "offline", "live", "real_data")
 
 
 def show(row: Row) -> None:

@@ -177,3 +177,22 @@ class Chirp:
         sweep = (self.end_frequency - self.start_frequency) / self.duration
         turns = self.start_frequency * running + 0.5 * sweep * running**2
         return _z_only(0.5 * self.peak_to_peak * np.cos(2 * np.pi * turns))
+
+
+@dataclass(frozen=True, slots=True)
+class Multisine:
+    """Z swings at several ``frequencies`` [Hz] at once, each with ``amplitude`` [m].
+
+    Their phases keep the peak low (Schroeder 1970). Before its start it swings already.
+    """
+
+    frequencies: tuple[float, ...] = (0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9)
+    amplitude: float = 3e-6
+    duration: float = 20.0
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Commanded axes at ``time`` [s]."""
+        count, z = len(self.frequencies), np.zeros_like(time)
+        for k, frequency in enumerate(self.frequencies):
+            z = z + np.cos(2 * np.pi * frequency * time - np.pi * k * k / count)
+        return _z_only(self.amplitude * z)

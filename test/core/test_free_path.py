@@ -1,16 +1,13 @@
 """Motions that never rest identify too, and are trusted no further than they go."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from omsm_ros.core.confidence import response_band
 from omsm_ros.core.identify import identify
 from omsm_ros.core.motion_record import MotionRecord, assemble
-from omsm_ros.core.records import FloatArray
 from omsm_ros.core.surface import Flat
-from omsm_ros.core.trajectory import AxisPositions, Chirp
+from omsm_ros.core.trajectory import Chirp, Multisine
 from omsm_ros.core.transfer_function import TransferFunction
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
@@ -20,19 +17,6 @@ LIGHT_MODE = Plant(TransferFunction.from_ascending([1.0], [1.0, 0.04 / OMEGA, OM
 # Starts and ends in full swing.
 FROM_THE_MIDDLE = slice(7321, 21_117)
 WHOLE = slice(None)
-
-
-@dataclass(frozen=True)
-class Sines:
-    """Seven lines of 3 µm each, 0.7 to 14.9 Hz."""
-
-    duration: float = 20.0
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        lines = [0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9]
-        waves = [np.cos(2 * np.pi * f * time + k * k) for k, f in enumerate(lines)]
-        zero = np.zeros_like(time)
-        return AxisPositions(zero, zero, 3e-6 * np.sum(waves, axis=0), zero, zero)
 
 
 def identified(motion, plant, part, seed):
@@ -50,8 +34,8 @@ def identified(motion, plant, part, seed):
         (Chirp(), LIGHT_MODE, WHOLE, 15.0),
         (Chirp(), LIGHT_MODE, FROM_THE_MIDDLE, 12.7),
         (Chirp(end_frequency=50.0, peak_to_peak=20e-6), LIGHT_MODE, FROM_THE_MIDDLE, 42.0),
-        (Sines(), Plant(), WHOLE, 14.9),
-        (Sines(), LIGHT_MODE, WHOLE, 14.9),
+        (Multisine(), Plant(), WHOLE, 14.9),
+        (Multisine(), LIGHT_MODE, WHOLE, 14.9),
     ],
 )
 @pytest.mark.parametrize("seed", [3, 4])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.surface import PAPER_MIRROR, Flat
-from omsm_ros.core.trajectory import Chirp, Circle, Spiral, StepTest, s_curve
+from omsm_ros.core.trajectory import Chirp, Circle, Multisine, Spiral, StepTest, s_curve
 from omsm_ros.errors import ConfigurationError
 
 
@@ -70,6 +70,15 @@ def test_chirp_rises_linearly_in_frequency():
     crossings = np.sum(np.diff(np.sign(chirp.positions(time).z)) != 0)
     assert crossings / 2 == pytest.approx(0.5 * (1 + 5) * 10, abs=0.5)
     assert np.ptp(turns) > 0
+
+
+def test_a_multisine_has_its_lines_and_no_others():
+    motion = Multisine(frequencies=(2.0, 3.0, 7.0), amplitude=2e-6, duration=10.0)
+    z = motion.positions(np.arange(10_000) * 1e-3).z
+    lines = 2 * np.abs(np.fft.rfft(z)) / len(z)
+    np.testing.assert_allclose(lines[[20, 30, 70]], 2e-6)
+    lines[[20, 30, 70]] = 0.0
+    assert np.max(lines) < 1e-15
 
 
 @pytest.mark.parametrize(
