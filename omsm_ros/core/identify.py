@@ -281,6 +281,7 @@ def _further(
         "static_gain": abs(best.gain),
         "static_gain_uncertainty": float(np.sqrt(known.gain_variance)),
         "polarity": polarity,
+        "shown_up_to_hz": known.shown_up_to,
         "drift_m_s": 2 * float(best.background[1]) / (len(record) * record.sample_period),
         "backlash_m": backlash,
         "shape": finite_values(shape(best.dynamics, 0.5 / record.sample_period)),

@@ -209,12 +209,16 @@ def _gain_headline(gain: float, spread: float | None) -> Headline:
 
 def _range_headline(calibration: Calibration) -> Headline:
     verdict, _ = verdict_of(calibration)
-    nyquist = quantity(0.5 / calibration.sample_period, "Hz")
-    if verdict == REJECTED:
-        name, detail = "Known within limits up to", "rejected: not to be used"
-    else:
-        name, detail = "Valid up to", f"half the sampling rate is {nyquist}"
-    return Headline(name, quantity(calibration.valid_up_to, "Hz"), detail)
+    name, details = "Known within limits up to", ["rejected: not to be used"]
+    if verdict != REJECTED:
+        nyquist = 0.5 / calibration.sample_period
+        shown = number(calibration.certificate.get("shown_up_to_hz"))
+        name, details = "Valid up to", [f"half the sampling rate is {quantity(nyquist, 'Hz')}"]
+        if shown is not None and calibration.valid_up_to < nyquist:
+            told = calibration.valid_up_to < shown
+            ends = "the band leaves its limits" if told else "the motion tells too little"
+            details.insert(0, f"beyond it {ends}")
+    return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
 
 
 def _order_headline(calibration: Calibration) -> Headline:

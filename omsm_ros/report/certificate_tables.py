@@ -25,7 +25,7 @@ _SHOWN = {
     "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
     "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
     "shape", "modal_remainder", "two_mass", "static_gains", "nonparametric_agreement", "samples",
-    "warnings", "reasons", "verdict", "limits", "input",
+    "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
 }  # fmt: skip
 
 Certificate = Mapping[str, Any]
@@ -94,6 +94,11 @@ def residual_table(certificate: Certificate) -> Table:
             "χ² against the estimate without a model",
             plain(certificate.get("nonparametric_agreement")),
             "about 1 if the two agree",
+        ),
+        (
+            "shown up to",
+            quantity(certificate.get("shown_up_to_hz"), "Hz"),
+            "beyond it the motion would show no deviation as large as the limits",
         ),
         ("edges", count(certificate.get("edges")), ""),
     ]

@@ -101,6 +101,11 @@ def by_name(calibration):
     return {h.name: h.value.replace("\u202f", " ") for h in headlines(calibration)}
 
 
+def range_detail(calibration):
+    (detail,) = (h.detail for h in headlines(calibration) if h.name == "Valid up to")
+    return detail.replace("\u202f", " ")
+
+
 class TestPage:
     def test_says_all_that_the_certificate_says(self, page, calibration):
         entries = calibration.certificate
@@ -226,6 +231,18 @@ class TestVerdict:
         text = Page(render(bare(bad))).text
         assert "✕ Rejected too sharp" in text
         assert "rejected: not to be used" in text
+
+    @pytest.mark.parametrize(
+        ("valid", "shown", "why"),
+        [(60.0, 80.0, "the band leaves its limits"), (60.0, 60.0, "the motion tells too little")],
+    )
+    def test_accepted_says_why_no_further(self, calibration, valid, shown, why):
+        short = replace(certified(calibration, shown_up_to_hz=shown), valid_up_to=valid)
+        assert range_detail(short).startswith(f"beyond it {why}; half the")
+
+    def test_accepted_to_the_end_has_no_beyond(self, calibration):
+        whole = replace(certified(calibration, shown_up_to_hz=500.0), valid_up_to=500.0)
+        assert range_detail(whole) == "half the sampling rate is 500 Hz"
 
     def test_accepted_names_the_evidence(self, calibration):
         reasons = " ".join(judge(calibration).reasons)
