@@ -155,7 +155,7 @@ def step_response(
     probe: FloatArray,
     predicted: FloatArray | None = None,
 ) -> Figure:
-    """One of the steepest edges of a step test, and how far the probe is from it.
+    """One of the steepest moves, an edge of a step test, and how far the probe is from it.
 
     Each array is of shape (n,), positions in [m].
 
@@ -184,8 +184,8 @@ def step_response(
         model, name = predicted[window], "carriage through $G_m$"
         draw(upper, (model - edge[0]) / MICROMETRE_M, style.AFTER, name, (0, (3, 2)))
         draw(lower, (seen - model) / NANOMETRE_M, style.AFTER, f"probe − {name}")
-    style.label(upper, y="motion [µm]", title="Step response")
-    style.label(lower, x="time since the edge [ms]", y="error [nm]")
+    style.label(upper, y="motion [µm]", title="Steepest move")
+    style.label(lower, x="time since it began [ms]", y="error [nm]")
     style.legend_above(upper)
     style.legend_above(lower)
     made.align_ylabels()
