@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.confidence import ResponseLimits
+from omsm_ros.core.confidence import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.hankel import HankelVote
 from omsm_ros.core.order import Candidate
 from omsm_ros.core.transfer_function import TransferFunction
@@ -30,6 +30,7 @@ class Evidence:
     whiteness, independence: p-values of the residual's tests
     limits: of the 95 % band, within which the response is trusted up to ``valid_up_to``
     delay_noise, delay_uncertainty: of the low-frequency delay, from noise alone and in all
+    gain_apart: standard uncertainty of the static gain, whatever lag and curvature G has
     widened: factor on all uncertainties, for an order asked for that leaves things open
     clearly_better: number of poles that the data ask for instead, or None
     """
@@ -45,6 +46,7 @@ class Evidence:
     delay_noise: float
     delay_uncertainty: float
     inter_sample_delay_bound: float
+    gain_apart: float
     edges: int
     widened: float = 1.0
     clearly_better: int | None = None
@@ -115,6 +117,12 @@ def _reasons(evidence: Evidence) -> list[str]:
             f"where the axis moves the residual is only {evidence.chi_square:.2g} times the noise "
             f"of {evidence.noise * 1e9:.3g} nm squared: the probe is not quiet where the axis "
             "rests, or the stated noise is too large; start the recording after a second of rest"
+        )
+    if COVERAGE_FACTOR * evidence.gain_apart > evidence.limits.gain:
+        reasons.append(
+            "the motion does not tell the static gain from the dynamics (its gain alone is "
+            f"uncertain by {100 * COVERAGE_FACTOR * evidence.gain_apart:.2g} %): move in steps, or "
+            "at several frequencies at once"
         )
     if evidence.valid_up_to < _LEAST_TRUSTED_HZ:
         reasons.append(

@@ -18,7 +18,7 @@ COVERAGE_FACTOR = 1.959964
 _MAX_NOISE_ORDER = 12
 # Octaves from one trial frequency to the next.
 _SHOWN_STEP = 1 / 24
-# Directions of the parameter space this much weaker than the strongest are left out.
+# Directions of the parameter space this much weaker than the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11
 
 
@@ -104,8 +104,13 @@ def parameter_covariance(
     meat = np.real(np.conj(spectrum).T @ weighted) / length
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0] = 1.0
-    bread = np.linalg.pinv((columns / scale).T @ (columns / scale), _RANK_TOLERANCE, True)
+    values, directions = np.linalg.eigh((columns / scale).T @ (columns / scale))
+    least = _RANK_TOLERANCE * float(values[-1])
+    strong, weak = directions[:, values > least], directions[:, values <= least]
+    bread = strong / values[values > least] @ strong.T
     inside = bread @ (meat / np.outer(scale, scale)) @ bread
+    # Of a weak direction the data know nothing: at least as little as of the weakest strong one.
+    inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
     covariance = inside / np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))
 

@@ -235,6 +235,12 @@ def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
     )
 
 
+def _gain_apart(problem: Problem, best: Fit) -> float:
+    """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
+    every = parameter_covariance(problem, problem.bent(best), best.residual)
+    return float(np.sqrt(every[0, 0]) / abs(best.gain))
+
+
 def _symmetric(matrix: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (matrix + matrix.T))
 
@@ -265,6 +271,7 @@ def _evidence(
         delay_noise=_delay_uncertainty(best.dynamics, known.from_noise),
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),
         inter_sample_delay_bound=known.hidden_delay,
+        gain_apart=_gain_apart(problem, best),
         edges=len(prepared.steps.edges),
         widened=known.widened,
         clearly_better=known.clearly_better,

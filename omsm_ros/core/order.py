@@ -59,9 +59,7 @@ def information(fit: Fit, colour: float = 1.0) -> float:
     """
     n = fit.samples
     floor = float(np.finfo(np.float64).tiny)
-    return float(
-        n * np.log(max(fit.sum_of_squares, floor) / n) + colour * fit.structure.size * np.log(n)
-    )
+    return float(n * np.log(max(fit.sum_of_squares, floor) / n) + colour * fit.size * np.log(n))
 
 
 def explore(
@@ -109,9 +107,8 @@ def _promising(
     largest = fit_structure(every[-1], [c.fit for c in found])
     best = min(c.bic for c in found)
     found.append(Candidate(largest, information(largest, colour)))
-    per_parameter = colour * np.log(largest.samples)
-    free = information(largest, colour) - largest.structure.size * per_parameter
-    return [s for s in every[:-1] if free + s.size * per_parameter < best]
+    spare = (best - information(largest, colour)) / (colour * np.log(largest.samples))
+    return [s for s in every[:-1] if s.size < largest.structure.size + spare]
 
 
 def choose(

@@ -186,6 +186,19 @@ class Problem:
         every = np.concatenate([by_numerator, by_shape, by_gain, driven[terms:]])
         return np.column_stack([self._in_time(every).T, self._fixed])
 
+    def bent(self, fitted: Fit) -> FloatArray:
+        """d output / d(gain, lag, curvature, further drives, background) of the response, (k, …).
+
+        That is by coefficients of 1, s and s² in front of it: any response bends like that.
+        """
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        driven = self._driven(fitted.structure, lag)
+        terms = len(fitted.numerator)
+        bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
+        return np.column_stack(
+            [self._in_time(np.concatenate([bends, driven[terms:]])).T, self._fixed]
+        )
+
 
 def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
     """Least squares with a triangle that may be singular to rounding."""
@@ -231,6 +244,11 @@ class Fit:
     def numerator(self) -> FloatArray:
         """Scaled, (m+1,), numerator[0] = 1."""
         return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters: of the structure, and of further drives."""
+        return self.structure.size + len(self.driven) - len(self.numerator)
 
     @property
     def samples(self) -> int:

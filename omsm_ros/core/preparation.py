@@ -162,7 +162,8 @@ def check_gain(gain: float) -> None:
     if not low <= abs(gain) <= high:
         raise IdentificationError(
             f"the probe moves by {gain!r} per travel of the axis, expected about 1: check that it "
-            "looks at a fixed target within its range, and that both are in metres"
+            "looks at a fixed target within its range, that both are in metres, and that Z "
+            "moves to and fro, for what goes evenly one way is taken for drift"
         )
 
 

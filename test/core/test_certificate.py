@@ -25,6 +25,7 @@ GOOD = Evidence(
     delay_noise=1e-6,
     delay_uncertainty=1e-6,
     inter_sample_delay_bound=1e-8,
+    gain_apart=1e-5,
     edges=20,
 )
 SLOW = TransferFunction.from_ascending([1.0], [1.0, 1e-2])
@@ -51,6 +52,7 @@ def test_good_evidence_is_accepted_as_far_as_it_goes():
         ({"chi_square": 0.1}, "not quiet"),
         ({"valid_up_to": 1.0}, "more or larger steps"),
         ({"inter_sample_delay_bound": 5e-6}, "between samples"),
+        ({"gain_apart": 0.02}, "uncertain by 3.9 %"),
     ],
 )
 def test_bad_evidence_is_rejected_by_name(changed, reason):

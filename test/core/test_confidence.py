@@ -77,6 +77,17 @@ def test_noise_of_the_motion_counts_where_a_resonance_lifts_it():
     assert np.all(np.mean(without, axis=0) < 0.7 * scatter)
 
 
+def test_what_the_data_cannot_tell_apart_is_not_known():
+    """Two columns that are one: their sum is known as before, their difference not at all."""
+    rng = np.random.default_rng(3)
+    column, residual = rng.normal(size=4000), rng.normal(0, 0.1, 4000)
+    once = parameter_covariance(problem_for(4000), column[:, np.newaxis], residual)
+    twice = parameter_covariance(problem_for(4000), np.column_stack([column, column]), residual)
+    together, apart = np.array([1.0, 1.0]), np.array([1.0, -1.0])
+    assert together @ twice @ together == pytest.approx(once[0, 0], rel=1e-3)
+    assert apart @ twice @ apart > 1e9 * once[0, 0]
+
+
 def test_white_noise_needs_no_autoregression():
     orders = [len(autoregression(np.random.default_rng(s).normal(size=2000))[0]) for s in range(20)]
     assert np.sum(np.array(orders) > 1) <= 2

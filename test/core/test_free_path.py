@@ -9,8 +9,9 @@ from omsm_ros.core.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface import Flat
 from omsm_ros.core.trajectory import Chirp, Multisine
 from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.errors import IdentificationError
 from omsm_ros.twin.cell import Cell, record
-from omsm_ros.twin.plant import Plant
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 OMEGA = 2 * np.pi * 60
 LIGHT_MODE = Plant(TransferFunction.from_ascending([1.0], [1.0, 0.04 / OMEGA, OMEGA**-2]))
@@ -49,3 +50,37 @@ def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, par
     band = response_band(calibration.dynamics, calibration.covariance, frequency)
     assert np.max(np.abs(error.real) / band.gain) < 3.5
     assert np.max(np.abs(error.imag) / band.phase) < 3.5
+
+
+@pytest.mark.parametrize(("frequency", "plant"), [(5.0, Plant()), (5.0, LIGHT_MODE)])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
+    """Gain and phase at one frequency are two numbers; static gain, lag and curvature are three."""
+    sine = Multisine(frequencies=(frequency,), amplitude=20e-6)
+    certificate = identified(sine, plant, WHOLE, seed).certificate
+    assert certificate["verdict"] == "rejected"
+    assert "does not tell the static gain from the dynamics" in certificate["reasons"][0]
+
+
+def test_a_second_frequency_tells_them_apart():
+    sines = Multisine(frequencies=(2.0, 9.0), amplitude=15e-6)
+    calibration = identified(sines, LIGHT_MODE, WHOLE, 1)
+    assert calibration.certificate["verdict"].startswith("accepted")
+    assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_even_ramp_may_be_drift(seed):
+    rng = np.random.default_rng(seed)
+    z = rng.normal(2e-9 * np.arange(20_000), 4e-10)
+    ramp = MotionRecord.from_arrays(1e-3, z, rng.normal(-z, 1e-8))
+    assert any(reason in refusal(ramp) for reason in ("moves to and fro", "static gain from the"))
+
+
+def refusal(record):
+    """Why nothing was identified."""
+    try:
+        certificate = identify(record).certificate
+    except IdentificationError as error:
+        return str(error)
+    return certificate["reasons"][0]

@@ -80,6 +80,12 @@ def test_with_free_decays_only_noise_is_left():
     assert without.rms > 2 * NOISE
 
 
+def test_decays_count_as_parameters():
+    of = problem(0.0)
+    assert fitted(of).size == MODE.size
+    assert fitted(replace(of, starts_moving=True)).size == MODE.size + MODE.poles
+
+
 def test_sensitivity_includes_the_decays():
     """Against differences of the output, at fixed linear parameters."""
     of = replace(problem(3e-6), starts_moving=True)

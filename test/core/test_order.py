@@ -13,6 +13,7 @@ from omsm_ros.core.transfer_function import TransferFunction
 def fitted(structure, sum_of_squares, samples=1000):
     return SimpleNamespace(
         structure=structure,
+        size=structure.size,
         sum_of_squares=sum_of_squares,
         samples=samples,
         dynamics=TransferFunction([1.0], [1.0, 1e-3]),

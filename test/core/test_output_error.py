@@ -117,6 +117,21 @@ def test_sensitivity_is_the_derivative_of_the_output():
     np.testing.assert_allclose(columns[:, 1], difference, atol=1e-3 * np.ptp(difference))
 
 
+def test_a_response_bends_by_gain_lag_and_curvature():
+    """Against the output of responses that differ by 1, s and s² in front."""
+    structure = Structure(2, 1, True)
+    problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
+    found = fit(problem, structure, [start(structure, [-1 + 1.5j, -1 - 1.5j])])
+    columns = problem.bent(found)
+    closed = close_period(problem.motion, PERIOD)
+    frequency = np.fft.rfftfreq(len(closed), PERIOD)
+    moved = np.fft.rfft(closed) * found.dynamics.response(frequency)
+    for power in range(3):
+        bent = moved * (2j * np.pi * frequency / RATE) ** power
+        expected = np.fft.irfft(bent, len(closed))[: len(problem.motion)]
+        np.testing.assert_allclose(columns[:, power], expected, atol=1e-9 * np.ptp(expected))
+
+
 def test_the_period_closes_without_a_jump():
     motion = np.linspace(0.0, 1.0, 1000)
     closed = close_period(motion, 1e-3)
