@@ -35,7 +35,7 @@ _CASES: tuple[tuple[str, Motion, Plant, slice, float], ...] = (
 )
 
 
-def rows(runs: int = 50) -> Iterator[Row]:
+def rows(runs: int = 100) -> Iterator[Row]:
     """Least share over frequency of runs whose band holds the truth, and how far it is trusted."""
     for name, motion, plant, part, reaches in _CASES:
         found = [
