@@ -15,6 +15,7 @@ from omsm_ros.core.motion_record import MotionRecord
 from omsm_ros.core.output_error import Problem, fit
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.step_test import (
+    LEAST_SAMPLES,
     Steps,
     backlash_columns,
     check_usable,
@@ -22,7 +23,7 @@ from omsm_ros.core.step_test import (
     sample_noise,
 )
 from omsm_ros.core.structure import Structure
-from omsm_ros.errors import ConfigurationError, IdentificationError
+from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.units import MICROMETRE_M
 
 # What happened before the record is forgotten after this time.
@@ -92,6 +93,12 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
     carried = _from_rest_to_rest(motion, steps.moving, record.sample_period)
     used &= carried == motion
+    if np.sum(used) < LEAST_SAMPLES:
+        raise StepTestError(
+            f"of {samples!r} samples {int(np.sum(used))!r} are left to compare, without those "
+            "lost, while something settles, and where the motion starts or ends; record at least "
+            f"{LEAST_SAMPLES} more"
+        )
     seen = np.where(record.ok, record.distance, 0.0)
     ramp = np.linspace(-1.0, 1.0, samples)
     return Problem(

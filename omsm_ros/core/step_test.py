@@ -18,7 +18,7 @@ from omsm_ros.errors import StepTestError
 from omsm_ros.units import MICROMETRE_M
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
-_LEAST_SAMPLES = 50
+LEAST_SAMPLES = 50
 # Far beyond the range of any probe that could have seen the motion.
 _GREATEST_TRAVEL_M = 20e-3
 # Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
@@ -74,10 +74,10 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
 
     Raises StepTestError when the axis does not move, or moves farther than any probe sees.
     """
-    if len(z) < _LEAST_SAMPLES:
+    if len(z) < LEAST_SAMPLES:
         raise StepTestError(
             f"{len(z)!r} samples are too few to identify anything; "
-            f"record at least {_LEAST_SAMPLES}, a step test takes about ten seconds"
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
         )
     noise, travel = sample_noise(z), float(np.ptp(z))
     if travel > _GREATEST_TRAVEL_M:
@@ -159,13 +159,13 @@ def backlash_columns(steps: Steps, samples: int) -> FloatArray:
 
 def check_usable(record: MotionRecord) -> None:
     """Raise StepTestError when too few samples of the record can be used, saying why."""
-    if len(record) < _LEAST_SAMPLES:
+    if len(record) < LEAST_SAMPLES:
         raise StepTestError(
             f"{len(record)!r} samples are too few to identify anything; "
-            f"record at least {_LEAST_SAMPLES}, a step test takes about ten seconds"
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
         )
     usable = int(np.sum(record.ok))
-    if usable < _LEAST_SAMPLES:
+    if usable < LEAST_SAMPLES:
         raise StepTestError(
             f"{usable!r} of {len(record)} samples are usable (counts {dict(record.counts)!r}); "
             "check the probe's target and range, and the encoder"

@@ -9,7 +9,7 @@ from omsm_ros.core.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface import Flat
 from omsm_ros.core.trajectory import Chirp, Multisine
 from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.errors import IdentificationError
+from omsm_ros.errors import IdentificationError, StepTestError
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
@@ -75,6 +75,15 @@ def test_an_even_ramp_may_be_drift(seed):
     z = rng.normal(2e-9 * np.arange(20_000), 4e-10)
     ramp = MotionRecord.from_arrays(1e-3, z, rng.normal(-z, 1e-8))
     assert any(reason in refusal(ramp) for reason in ("moves to and fro", "static gain from the"))
+
+
+@pytest.mark.parametrize("lost", [slice(35, 85), slice(0)])
+def test_too_little_left_between_the_ends_is_said(lost):
+    z = 20e-6 * np.sin(2 * np.pi * 15e-3 * np.arange(120 if lost.start else 60))
+    distance = np.random.default_rng(0).normal(-z, 1e-8)
+    distance[lost] = np.nan
+    with pytest.raises(StepTestError, match="are left to compare"):
+        identify(MotionRecord.from_arrays(1e-3, z, distance))
 
 
 def refusal(record):
