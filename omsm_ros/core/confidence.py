@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import fft
 
-from omsm_ros.core.output_error import Problem
+from omsm_ros.core.output_error import Fit, Problem
 from omsm_ros.core.records import FloatArray
 from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.units import DEGREE_RAD
@@ -113,6 +113,12 @@ def parameter_covariance(
     inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
     covariance = inside / np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def gain_apart(problem: Problem, fitted: Fit) -> float:
+    """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
+    every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
+    return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
 
 
 def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:

@@ -9,8 +9,9 @@ import numpy as np
 from scipy import fft
 
 from omsm_ros.core.calibration import Calibration
+from omsm_ros.core.closed_motion import motion_spectrum
 from omsm_ros.core.motion_record import MotionRecord
-from omsm_ros.core.output_error import Problem, close_period, denoised
+from omsm_ros.core.output_error import Problem
 from omsm_ros.core.preparation import Prepared, prepare
 from omsm_ros.core.records import FloatArray
 from omsm_ros.core.spectrum import FrequencyResponse, frequency_response
@@ -78,11 +79,10 @@ def explain(record: MotionRecord, calibration: Calibration, source: str = "encod
 
 def _through(dynamics: TransferFunction, problem: Problem) -> FloatArray:
     """G_m applied to the motion as the fit applies it: by its spectrum, closed to a period."""
-    closed = close_period(problem.motion, problem.period)
-    noise_power = len(problem.motion) * problem.noise**2
-    spectrum = denoised(np.asarray(fft.rfft(closed), np.complex128), noise_power)
-    frequency = fft.rfftfreq(len(closed), problem.period)[: len(spectrum)]
-    answered = fft.irfft(spectrum * dynamics.response(frequency), len(closed))
+    spectrum = motion_spectrum(problem.motion, problem.period, problem.noise)
+    length = problem.closed_length
+    frequency = fft.rfftfreq(length, problem.period)[: len(spectrum)]
+    answered = fft.irfft(spectrum * dynamics.response(frequency), length)
     return np.asarray(answered[: len(problem.motion)], np.float64)
 
 

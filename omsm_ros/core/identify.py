@@ -19,6 +19,7 @@ from omsm_ros.core.certificate import Evidence, certify
 from omsm_ros.core.confidence import (
     Band,
     ResponseLimits,
+    gain_apart,
     hidden_motion_covariance,
     noise_spectrum,
     parameter_covariance,
@@ -184,7 +185,7 @@ class _Known:
         covariance = _symmetric(from_noise + further)
         band = response_band(dynamics, covariance, _frequencies(problem))
         shown = _shown_up_to(problem, best, limits)
-        valid = min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
+        valid = _trusted_up_to(model, band, limits, shown)
         return cls(covariance, from_noise, float(every[size, size]), hidden, shown, valid)
 
 
@@ -211,10 +212,14 @@ def _no_surer(known: _Known, prepared: Prepared, model: Model, limits: ResponseL
     return replace(
         known,
         covariance=covariance,
-        valid_up_to=min(trusted_up_to(band, limits, _disagreement(model, band)), known.shown_up_to),
+        valid_up_to=_trusted_up_to(model, band, limits, known.shown_up_to),
         widened=factor,
         clearly_better=other.structure.poles if better else None,
     )
+
+
+def _trusted_up_to(model: Model, band: Band, limits: ResponseLimits, shown: float) -> float:
+    return min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
 
 
 def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
@@ -233,12 +238,6 @@ def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
         noise,
         limits,
     )
-
-
-def _gain_apart(problem: Problem, best: Fit) -> float:
-    """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
-    every = parameter_covariance(problem, problem.bent(best), best.residual)
-    return float(np.sqrt(every[0, 0]) / abs(best.gain))
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
@@ -271,7 +270,7 @@ def _evidence(
         delay_noise=_delay_uncertainty(best.dynamics, known.from_noise),
         delay_uncertainty=_delay_uncertainty(best.dynamics, known.covariance),
         inter_sample_delay_bound=known.hidden_delay,
-        gain_apart=_gain_apart(problem, best),
+        gain_apart=gain_apart(problem, best),
         edges=len(prepared.steps.edges),
         widened=known.widened,
         clearly_better=known.clearly_better,

@@ -16,20 +16,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft
 
+from omsm_ros.core.closed_motion import close_period, motion_spectrum
 from omsm_ros.core.records import BoolArray, FloatArray
 from omsm_ros.core.structure import Scaled, Structure
-from omsm_ros.core.trajectory import s_curve
 from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
 
-# Long enough that a bridge across the whole travel adds nothing near the fastest motion.
-_BRIDGE_S = 0.3
-_MIN_BRIDGE_SAMPLES = 64
-# In it a light mode rings down.
-_REST_S = 1.0
 _RANK_TOLERANCE = 1e-12
-_SMOOTHING_BINS = 101
 _RACE_EVALUATIONS = 5
 _FINISH_EVALUATIONS = 60
 _FIRST_DAMPING = 1e-3
@@ -39,36 +33,6 @@ _LONGEST_STEP = 3.0
 _CONVERGED = 1e-4
 # The pulse before a record has this content left, as a power of e, where its band ends.
 _PULSE_END = 14.0
-
-
-def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
-
-    On the way back it rests, until nothing rings when the record starts anew.
-    """
-    bridge = max(round(_BRIDGE_S / period), _MIN_BRIDGE_SAMPLES)
-    total = fft.next_fast_len(len(motion) + bridge + round(_REST_S / period), real=True)
-    phase = np.arange(1, total - len(motion) + 1) / bridge
-    way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
-    return np.concatenate([motion, way_back])
-
-
-def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
-    """The part of a motion's ``spectrum`` (k,) that is motion, up to its last such frequency.
-
-    Wiener's filter. Where an encoder shows only its noise, the probe saw nothing of it;
-    a fit that took it for motion would be paid for a response that vanishes there.
-    """
-    if noise_power <= 0:
-        return spectrum
-    width = min(_SMOOTHING_BINS, len(spectrum))
-    power = np.abs(spectrum) ** 2
-    smooth = ndimage.uniform_filter1d(power, width, mode="nearest")
-    weight = np.clip(1 - noise_power / np.maximum(smooth, np.finfo(np.float64).tiny), 0.0, 1.0)
-    # A mean of m exponential variables scatters by 1/√m; twice that is not motion.
-    weight[weight < 3 / np.sqrt(width)] = 0.0
-    last = int(np.flatnonzero(weight)[-1]) if np.any(weight) else 0
-    return np.asarray((weight * spectrum)[: last + 1], np.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +66,10 @@ class Problem:
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
-        raw = np.asarray(fft.rfft(close_period(self.motion, self.period)), np.complex128)
-        moved = denoised(raw, len(self.motion) * self.noise**2)
+        moved = motion_spectrum(self.motion, self.period, self.noise)
         # A decay may be faster than anything in the motion: then the whole band is needed.
-        return np.pad(moved, (0, len(raw) - len(moved))) if self.starts_moving else moved
+        missing = self.closed_length // 2 + 1 - len(moved)
+        return np.pad(moved, (0, missing)) if self.starts_moving else moved
 
     @cached_property
     def s(self) -> ComplexArray:

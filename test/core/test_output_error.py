@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.output_error import Problem, close_period, denoised, fit
+from omsm_ros.core.closed_motion import close_period
+from omsm_ros.core.output_error import Problem, fit
 from omsm_ros.core.structure import Scaled, Structure
 from omsm_ros.core.transfer_function import TransferFunction
 
@@ -130,32 +131,3 @@ def test_a_response_bends_by_gain_lag_and_curvature():
         bent = moved * (2j * np.pi * frequency / RATE) ** power
         expected = np.fft.irfft(bent, len(closed))[: len(problem.motion)]
         np.testing.assert_allclose(columns[:, power], expected, atol=1e-9 * np.ptp(expected))
-
-
-def test_the_period_closes_without_a_jump():
-    motion = np.linspace(0.0, 1.0, 1000)
-    closed = close_period(motion, 1e-3)
-    steps = np.abs(np.diff(np.append(closed, closed[0])))
-    assert np.max(steps[len(motion) - 1 :]) < 0.05
-    np.testing.assert_array_equal(closed[:1000], motion)
-
-
-def test_before_it_starts_anew_the_period_rests():
-    """Longer than a mode of 60 Hz and 2 % takes to lose all but a thousandth."""
-    motion = np.linspace(0.0, 1.0, 1000)
-    closed = close_period(motion, 1e-3)
-    assert np.log(1000) / (0.02 * 2 * np.pi * 60) < 1.0
-    np.testing.assert_array_equal(closed[-1000:], motion[0])
-
-
-def test_noise_is_taken_out_of_the_motion_and_motion_is_not():
-    rng = np.random.default_rng(5)
-    motion = smooth_motion()
-    noise = 4e-10
-    clean = np.fft.rfft(motion)
-    noisy = np.fft.rfft(motion + rng.normal(0, noise, len(motion)))
-    kept = denoised(noisy, len(motion) * noise**2)
-    assert len(kept) < 0.6 * len(noisy)
-    error = np.sum(np.abs(kept - clean[: len(kept)]) ** 2)
-    assert error < 0.5 * np.sum(np.abs(noisy - clean) ** 2)
-    assert np.sum(np.abs(clean[len(kept) :]) ** 2) < 1e-6 * np.sum(np.abs(clean) ** 2)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from omsm_ros.core.closed_motion import close_period
 from omsm_ros.core.motion_record import MotionRecord
-from omsm_ros.core.output_error import close_period
 from omsm_ros.core.preparation import content_frequency, prepare
 from omsm_ros.core.trajectory import StepTest
 from omsm_ros.errors import IdentificationError
