@@ -23,7 +23,7 @@ setup(
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
     # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace
     # built with --symlink-install, the code finds msg_defs/ itself:
-    #     package = Path(__file__).resolve().parent          (of a module in omsm_ros/)
+    #     package = Path(omsm_ros.__file__).resolve().parent       (omsm_ros/)
     #     package / "interfaces" / "msg"  if it exists, else  package.parent / "msg_defs" / "msg"
     packages=[*find_packages(include=[PACKAGE, f"{PACKAGE}.*"]), INTERFACES],
     package_dir={INTERFACES: os.path.relpath(ROOT / "msg_defs")},

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.row import Row, between
-from omsm_ros.core.calibration import REJECTED, Calibration
-from omsm_ros.core.confidence import COVERAGE_FACTOR, response_band
-from omsm_ros.core.modes import known_modes
-from omsm_ros.core.multibody import FITTED, TwoMass
-from omsm_ros.core.records import BoolArray, FloatArray
-from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.calibration import REJECTED, Calibration
+from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
+from omsm_ros.core.dynamics.modes import known_modes
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 
 
 def mode_errors(

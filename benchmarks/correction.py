@@ -14,18 +14,19 @@ import numpy as np
 from scipy import signal
 
 from benchmarks.row import Row, at_least, at_most, not_compared
-from omsm_ros.core.audit import audit
-from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.correct import CorrectionOptions, Corrector, join_points
-from omsm_ros.core.discretise import discretise
-from omsm_ros.core.identify import identify
-from omsm_ros.core.motion_record import assemble
-from omsm_ros.core.records import AxisBlock, DistanceBlock, SurfacePoints
-from omsm_ros.core.reversal import sideways_lag
-from omsm_ros.core.surface import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.trajectory import Spiral
-from omsm_ros.core.transfer_function import TransferFunction
-from omsm_ros.core.uncertainty import ErrorSources
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.discretisation_error import audit
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.core.verification.reversal import sideways_lag
 from omsm_ros.twin.cell import Cell, Recording, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.scenario import Scenario, step_test_of

@@ -23,16 +23,17 @@ from benchmarks.against_truth import (
     worst,
 )
 from benchmarks.row import Row, at_least, at_most, between
-from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.confidence import COVERAGE_FACTOR, hidden_motion_covariance, response_band
-from omsm_ros.core.identify import identify
-from omsm_ros.core.motion_record import MotionRecord, assemble
-from omsm_ros.core.multibody import FITTED, TwoMass
-from omsm_ros.core.records import BoolArray, FloatArray
-from omsm_ros.core.step_plan import StepPlan, plan_steps
-from omsm_ros.core.surface import Flat
-from omsm_ros.core.trajectory import Motion, StepTest
-from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.fitting.covariance import hidden_motion_covariance
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.step_plan import StepPlan, plan_steps
+from omsm_ros.core.machine.trajectories import Motion, StepTest
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 

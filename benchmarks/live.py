@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_least, at_most
-from omsm_ros import conversions
-from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.records import AxisBlock, DistanceBlock
-from omsm_ros.files import save_calibration
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 # One turn of the spindle at 30 rpm: the blocks of a turn are published over and over.

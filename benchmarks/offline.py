@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_most
-from omsm_ros import bags
-from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.records import AxisBlock, DistanceBlock
-from omsm_ros.files import save_calibration
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.storage import bags
+from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
 from omsm_ros.units import NANOSECONDS_PER_S
 

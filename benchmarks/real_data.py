@@ -24,8 +24,8 @@ import numpy as np
 from scipy import io as scipy_io
 
 from benchmarks.row import Row, at_least
-from omsm_ros.core.held_command import identify_held
-from omsm_ros.core.records import FloatArray
+from omsm_ros.core.identification.held_command import identify_held
+from omsm_ros.core.samples.blocks import FloatArray
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "daisy"
 PERIODS_S = {"robotArm": 1.0, "hairdryer": 0.08, "ballbeam": 0.1}

@@ -13,31 +13,43 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # A module may import from its own layer and from those after it.
 LAYERS = [
     {"nodes", "cli"},
-    {"demonstration"},
-    {"measurement", "certification"},
-    {"publication"},
-    {"studies"},
-    {"offline"},
-    {"bags", "files", "conversions", "devices", "emulators", "report"},
+    {"jobs"},
+    {"report", "storage", "devices", "emulators"},
     {"twin", "protocols"},
     {"core"},
     {"errors", "units"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 
+# The rooms of the core, and which other rooms each may use.
+SAMPLES = set()
+DYNAMICS = SAMPLES | {"samples"}
+MACHINE = DYNAMICS | {"dynamics"}
+FITTING = MACHINE | {"machine"}
+ROOMS = {
+    "samples": SAMPLES,
+    "dynamics": DYNAMICS,
+    "machine": MACHINE,
+    "fitting": FITTING,
+    "identification": FITTING | {"fitting"},
+    "correction": FITTING,
+    "surface": FITTING | {"correction"},
+    "verification": FITTING | {"fitting", "identification", "correction", "surface"},
+}
+
 # Foreign modules that only one place may import.
 ONLY_IN = {
     "rclpy": {"nodes"},
-    "omsm_msgs": {"nodes", "conversions"},
-    "sensor_msgs": {"nodes", "conversions"},
-    "std_msgs": {"nodes", "conversions"},
+    "omsm_msgs": {"nodes", "storage.conversions"},
+    "sensor_msgs": {"nodes", "storage.conversions"},
+    "std_msgs": {"nodes", "storage.conversions"},
     "std_srvs": {"nodes"},
     "diagnostic_msgs": {"nodes"},
-    "builtin_interfaces": {"nodes", "conversions"},
+    "builtin_interfaces": {"nodes", "storage.conversions"},
     "rcl_interfaces": {"nodes"},
     "serial": {"devices.transport"},
     "socket": {"devices.transport"},
-    "rosbags": {"bags"},
+    "rosbags": {"storage"},
     "matplotlib": {"report"},
 }
 PURE = {"core", "protocols"}
@@ -81,6 +93,31 @@ def test_imports_go_one_way(path):
     for imported in _imports(path):
         if imported.split(".")[0] == "omsm_ros" and (target := _own(imported)) in RANK:
             assert RANK[target] >= RANK[layer], f"{_name(path)} looks up at {imported}"
+
+
+CORE = [p for p in MODULES if _name(p).startswith("core.") and p.stem != "__init__"]
+
+
+@pytest.mark.parametrize("path", CORE, ids=_name)
+def test_rooms_of_the_core_look_one_way(path):
+    parts = _name(path).split(".")
+    assert len(parts) == 3, f"{_name(path)} stands in no room of the core"
+    assert parts[1] in ROOMS, f"{parts[1]} is no room of the core; say what it may use"
+    for imported in _imports(path):
+        if imported.startswith("omsm_ros.core."):
+            room = imported.split(".")[2]
+            allowed = ROOMS[parts[1]] | {parts[1]}
+            assert room in allowed, f"{_name(path)} looks at {imported}"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_is_no_corridor(room):
+    assert len(list((PACKAGE / "core" / room).glob("[!_]*.py"))) <= 17, "make it two rooms"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=_name)
+def test_a_file_is_read_in_one_sitting(path):
+    assert len(path.read_text().splitlines()) <= 350, "is it still one thing?"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=_name)

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 import omsm_ros
-from omsm_ros.core.kinematics import Geometry
-from omsm_ros.core.uncertainty import ErrorSources
-from omsm_ros.files import load_surface
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.storage.machine_files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 SURFACES = {"paper_mirror"}
@@ -52,6 +52,6 @@ def test_every_node_with_parameters_has_its_yaml():
 
 
 def test_shipped_surface_is_the_papers():
-    from omsm_ros.core.surface import PAPER_MIRROR
+    from omsm_ros.core.surface.nominal import PAPER_MIRROR
 
     assert load_surface(ROOT / "config" / "paper_mirror.yaml") == PAPER_MIRROR

@@ -6,10 +6,11 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from omsm_ros import studies
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
-from omsm_ros.files import load_calibration, save_geometry
+from omsm_ros.jobs.study_scans import alignment_of, sideways_lag_of
+from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.machine_files import save_geometry
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
 
 # ------------------------------------------------------------------------------ reversal
@@ -25,7 +26,7 @@ def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("correcting", args.json) as progress:
         bags = (args.clockwise, args.counterclockwise)
-        return asdict(studies.sideways_lag_of(bags, calibration, progress))
+        return asdict(sideways_lag_of(bags, calibration, progress))
 
 
 _MEANINGS = {
@@ -62,7 +63,7 @@ def _align(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     known = geometry_of(args.geometry)
     with progress_bar("correcting", args.json) as progress:
-        found = studies.alignment_of(args.bag, calibration, args.radius, known, progress)
+        found = alignment_of(args.bag, calibration, args.radius, known, progress)
     save_geometry(args.out, found.geometry)
     names = ("centre_x", "centre_y", "beam_x", "beam_y")
     # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros import studies
 from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
-from omsm_ros.core.calibration import Calibration, verdict_of
-from omsm_ros.core.drift import compare
-from omsm_ros.core.identify import identify
-from omsm_ros.core.repeatability import Repeatability, repeatability
-from omsm_ros.core.step_plan import plan_csv, plan_gcode, plan_steps
-from omsm_ros.files import load_calibration, save_calibration, save_text
+from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
+from omsm_ros.core.verification.change import compare
+from omsm_ros.core.verification.repeatability import Repeatability, repeatability
+from omsm_ros.jobs.identify_bag import motion_of_bag
+from omsm_ros.jobs.verify_calibration import path_check_of
+from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.storage.files import save_text
 from omsm_ros.units import DEGREE_RAD, MICROSECOND_S, NANOMETRE_M
 
 # ------------------------------------------------------------------------------ identify
@@ -38,13 +40,13 @@ def _declare_identify(sub: argparse.ArgumentParser) -> None:
 
 def _identify(args: argparse.Namespace) -> Facts:
     with progress_bar("reading", args.json) as progress:
-        motion = studies.motion_of_bag(args.bag, duration=args.duration, progress=progress)
+        motion = motion_of_bag(args.bag, duration=args.duration, progress=progress)
     calibration = identify(motion, order=args.order, input=args.input, settings=args.settings)
     save_calibration(args.out, calibration)
     facts = calibration_facts(calibration) | {"calibration": str(args.out)}
     if args.report is not None:
         # Drawing takes a second to import; most commands do without.
-        from omsm_ros.certification import write_certificate
+        from omsm_ros.jobs.certify import write_certificate
 
         page = write_certificate(
             args.report, calibration, motion, input=args.input, source=args.bag.name
@@ -95,7 +97,7 @@ def _declare_verify(sub: argparse.ArgumentParser) -> None:
 def _verify(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("reading", args.json) as progress:
-        check = studies.path_check_of(args.bag, calibration, progress)
+        check = path_check_of(args.bag, calibration, progress)
     edges = np.arange(0.0, math.floor(check.frequency.max()) + 1.0)
     bands = [
         {

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from tqdm import tqdm
 
-from omsm_ros.offline import Progress
+from omsm_ros.jobs.read_bag import Progress
 
 Facts: TypeAlias = "dict[str, Any]"
 

@@ -6,14 +6,18 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from omsm_ros import offline
 from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
-from omsm_ros.core.correct import CorrectionOptions
-from omsm_ros.core.kinematics import Geometry
-from omsm_ros.core.predict import DEFAULT_BUDGET_M, predict_error
-from omsm_ros.core.uncertainty import sources_with
-from omsm_ros.files import load_calibration, load_geometry, load_motion, load_surface
-from omsm_ros.measurement import Admission, measure
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
+from omsm_ros.core.correction.uncertainty import sources_with
+from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.jobs.correct_bag import ByStamps
+from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
+from omsm_ros.jobs.measure import Admission, measure
+from omsm_ros.jobs.read_bag import motion_in
+from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.machine_files import load_geometry, load_surface
+from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
@@ -32,8 +36,8 @@ def _declare_inspect(sub: argparse.ArgumentParser) -> None:
 
 def _inspect(args: argparse.Namespace) -> Facts:
     with progress_bar("reading", args.json) as progress:
-        found = offline.inspect_bag(args.bag, progress)
-    return {"bag": str(args.bag), "topics": offline.as_json(found)}
+        found = inspect_bag(args.bag, progress)
+    return {"bag": str(args.bag), "topics": as_json(found)}
 
 
 def _show_inspect(facts: Facts) -> None:
@@ -99,7 +103,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             options=options,
             admission=Admission(args.settings, args.override),
             lateral=args.lateral,
-            by_stamps=offline.ByStamps(args.delay, args.exposure) if args.by_stamps else None,
+            by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
             report=not args.no_report,
             progress=progress,
         )
@@ -132,7 +136,7 @@ def _predict(args: argparse.Namespace) -> Facts:
         z, period = load_motion(args.motion)
     else:
         with progress_bar("reading", args.json) as progress:
-            z, period = offline.motion_in(args.motion, progress)
+            z, period = motion_in(args.motion, progress)
     return asdict(predict_error(calibration, z, period, args.budget))
 
 

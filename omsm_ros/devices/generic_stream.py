@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.records import MAX_BLOCK_SAMPLES, AxisBlock, DistanceBlock, IntArray
+from omsm_ros.core.samples.blocks import MAX_BLOCK_SAMPLES, AxisBlock, DistanceBlock, IntArray
 from omsm_ros.devices.clock import DeviceClock
 from omsm_ros.devices.transport import Transport
 from omsm_ros.errors import ConfigurationError

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.records import BoolArray, Status
+from omsm_ros.core.samples.blocks import BoolArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.generic_stream import (
     AXES,

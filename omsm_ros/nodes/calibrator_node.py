@@ -9,13 +9,12 @@ from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.srv import Identify
 from rclpy.node import Node
 
-from omsm_ros import conversions
-from omsm_ros.core.calibration import REJECTED, Calibration, verdict_of
-from omsm_ros.core.identify import identify
-from omsm_ros.core.motion_buffer import BlockBuffer
-from omsm_ros.core.motion_record import MotionRecord, assemble
+from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.samples.motion_buffer import BlockBuffer
+from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import save_calibration
+from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.nodes.running import (
     LATCHED_QOS,
     NAMESPACE,
@@ -26,7 +25,8 @@ from omsm_ros.nodes.running import (
     run,
     settings_of,
 )
-from omsm_ros.studies import motion_of_bag
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import save_calibration
 
 
 class CalibratorNode(Node):
@@ -111,7 +111,7 @@ class CalibratorNode(Node):
         if not self._report_folder:
             return ""
         # Drawing takes a second to import; most calibrators do without.
-        from omsm_ros.certification import write_certificate
+        from omsm_ros.jobs.certify import write_certificate
 
         try:
             page = write_certificate(

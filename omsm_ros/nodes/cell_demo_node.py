@@ -23,8 +23,8 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from omsm_ros.demonstration import Demonstration, conclude, table_of
 from omsm_ros.errors import DeviceTimeoutError, OmsmError
+from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
 
 _SERVICE_TIMEOUT_S = 60.0

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from rclpy.node import Node
 
-from omsm_ros import conversions
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
 from omsm_ros.devices.transport import transport_for
 from omsm_ros.errors import DeviceError
@@ -23,6 +22,7 @@ from omsm_ros.nodes.running import (
     run,
 )
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling, ProbeScaling, StreamScaling
+from omsm_ros.storage import conversions
 
 _READ_TIMEOUT_S = 0.05
 _RECONNECT_S = 0.5

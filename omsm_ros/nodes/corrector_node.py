@@ -13,16 +13,15 @@ from omsm_msgs.srv import LoadCalibration, PredictError
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from omsm_ros import conversions
-from omsm_ros.core.applicability import admit, objections
-from omsm_ros.core.calibration import Calibration
-from omsm_ros.core.cloud import pack_points
-from omsm_ros.core.correct import CorrectionOptions, Corrector
-from omsm_ros.core.kinematics import Geometry
-from omsm_ros.core.load import LoadMeter
-from omsm_ros.core.uncertainty import ErrorSources, sources_with
+from omsm_ros.core.correction.applicability import admit, objections
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import pack_points
+from omsm_ros.core.correction.uncertainty import ErrorSources, sources_with
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.samples.throughput import LoadMeter
 from omsm_ros.errors import OmsmError
-from omsm_ros.files import load_calibration
+from omsm_ros.jobs.predict_motion import predict_from
 from omsm_ros.nodes.running import (
     LATCHED_QOS,
     NAMESPACE,
@@ -34,7 +33,8 @@ from omsm_ros.nodes.running import (
     run,
     settings_of,
 )
-from omsm_ros.offline import predict_from
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import load_calibration
 
 MessageInfo: TypeAlias = "dict[str, int]"
 

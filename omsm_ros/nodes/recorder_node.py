@@ -8,7 +8,6 @@ from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from omsm_ros import bags
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.nodes.running import (
     LATCHED_QOS,
@@ -19,6 +18,7 @@ from omsm_ros.nodes.running import (
     parameter,
     run,
 )
+from omsm_ros.storage import bags
 
 _TOPICS = {
     bags.AXES_TOPIC: (AxisBlock, SAMPLES_QOS),

@@ -16,7 +16,7 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
-from omsm_ros.core.records import FloatArray, IntArray, Status
+from omsm_ros.core.samples.blocks import FloatArray, IntArray, Status
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.records import AxisBlock, DistanceBlock, FloatArray, Status
-from omsm_ros.core.surface import Surface
-from omsm_ros.core.trajectory import Motion
-from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.trajectories import Motion
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant, respond
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, NANOSECONDS_PER_S

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.records import FloatArray
-from omsm_ros.core.surface import Surface
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, signal
 
-from omsm_ros.core.records import FloatArray
-from omsm_ros.core.trajectory import Motion
-from omsm_ros.core.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.machine.trajectories import Motion
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 
 PAPER_EQ_12 = TransferFunction.from_ascending(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from omsm_ros.core.surface import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
-from omsm_ros.core.trajectory import Spiral, StepTest
+from omsm_ros.core.machine.trajectories import Spiral, StepTest
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.figure_error import FigureError
 

@@ -7,24 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omsm_ros.core.records import FloatArray, IntArray
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Recording
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class Departure:
     """Peak to valley and root mean square about zero of an error [m]."""
 
     peak_to_valley: float
     rms: float
 
 
-def spread(error: FloatArray, weight: FloatArray | None = None) -> Spread:
-    """Spread of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
+def spread(error: FloatArray, weight: FloatArray | None = None) -> Departure:
+    """Departure of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
     if not len(error):
         raise DataError("no points to compare with the truth")
-    return Spread(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))
+    return Departure(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +36,12 @@ class TruthComparison:
     surface_deviation: corrected height minus the true surface
     """
 
-    dynamic_error_before: Spread
-    dynamic_error_after: Spread
-    surface_deviation: Spread
+    dynamic_error_before: Departure
+    dynamic_error_after: Departure
+    surface_deviation: Departure
 
 
-def compare(
+def departure_from_truth(
     recording: Recording, sample: ArrayLike, height: FloatArray, dynamic_error: FloatArray
 ) -> TruthComparison:
     """Compare corrected points, each array (n,), with the truth of the recording they came from.

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omsm_ros.core.records import Status
+from omsm_ros.core.samples.blocks import Status
 from omsm_ros.devices.generic_stream import (
     BlockPair,
     GenericStreamDevice,

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omsm_ros.core.records import Status
-from omsm_ros.core.surface import OffAxisParaboloid
-from omsm_ros.core.trajectory import Spiral
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.surface.nominal import OffAxisParaboloid
 from omsm_ros.devices.generic_stream import BlockPair, GenericStreamDevice, StreamSettings
 from omsm_ros.devices.transport import SerialTransport
 from omsm_ros.emulators import generic_stream

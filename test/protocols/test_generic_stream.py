@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from omsm_ros.core.records import Status
+from omsm_ros.core.samples.blocks import Status
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.protocols.generic_stream import (
     ENCODED_SIZE,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.report.cloud_view import CloudView
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.report.measurement.cloud_view import CloudView
 from omsm_ros.twin.figure_error import FigureError
 
 POINTS = 40_000

@@ -8,7 +8,7 @@ pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
 
 from omsm_msgs.srv import Identify
 
-from omsm_ros import bags
+from omsm_ros.storage import bags
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.scenario import Scenario, step_test_of
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from std_srvs.srv import Trigger
 
-from omsm_ros.files import save_calibration
+from omsm_ros.storage.calibration_file import save_calibration
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(0)]
 

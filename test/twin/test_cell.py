@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.records import Status
-from omsm_ros.core.surface import Flat
-from omsm_ros.core.trajectory import StepTest
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface import PAPER_MIRROR
-from omsm_ros.core.trajectory import Spiral
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
 

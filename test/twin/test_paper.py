@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.alias import folded_frequency, sampling_distance
-from omsm_ros.core.surface import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.trajectory import Spiral, StepTest
-from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.aliasing import folded_frequency, sampling_distance
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.trajectories import Spiral, StepTest
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant, respond
 
 REFERENCE = [  # frequency [Hz], gain, phase [deg] of Eq. 12
@@ -113,7 +113,7 @@ def test_sampling_distance_of_table_1(rpm, micrometres):
 
 
 def test_chirp_of_figure_9():
-    from omsm_ros.core.trajectory import Chirp
+    from omsm_ros.core.machine.trajectories import Chirp
 
     chirp, period = Chirp(), 1e-3
     assert (chirp.peak_to_peak, chirp.end_frequency, chirp.duration) == (40e-6, 15.0, 25.0)

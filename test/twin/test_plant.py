@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.trajectory import AxisPositions, Chirp, Spiral, StepTest
-from omsm_ros.core.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.trajectories import AxisPositions, Chirp, Spiral, StepTest
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant, respond
 from omsm_ros.units import NANOMETRE_M

@@ -1,0 +1,1 @@
+"""From a recording and a calibration to surface points, each with its uncertainty."""

@@ -1,0 +1,95 @@
+"""Does this calibration belong to these data?
+
+A calibration holds for the probe's rate, exposure and averaging, for the machine and the
+fixture it was made with. What differs is told in full sentences; whoever corrects anyway
+records them with the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.errors import CalibrationError
+
+SAME_RATE = 1e-6
+_SAME_VALUE = 1e-6
+
+
+def objections(
+    calibration: Calibration,
+    *,
+    sample_period: float | None = None,
+    settings: Mapping[str, object] | None = None,
+    polarity: int | None = None,
+    age: float | None = None,
+    max_age: float | None = None,
+) -> tuple[str, ...]:
+    """Why ``calibration`` should not be used; empty if nothing speaks against it.
+
+    sample_period: of the data [s];  polarity: that the correction will use
+    settings: as they are now; a name that both sides know must have the same value, one that
+        the calibration was made with must not be missing
+    age, max_age: since it was made, and when it is stale [s]
+    """
+    found = [*_certificate(calibration, polarity)]
+    expected = calibration.sample_period
+    if sample_period is not None and abs(sample_period - expected) > SAME_RATE * expected:
+        found.append(f"sample period is {sample_period!r} s, calibrated at {expected!r} s")
+    if settings is not None:
+        found += _differences(calibration.settings, settings)
+    if age is not None and max_age is not None and age > max_age:
+        found.append(f"it was made {age:.0f} s ago, more than the {max_age:.0f} s allowed")
+    return tuple(found)
+
+
+def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) -> dict[str, object]:
+    """What to record of the decision to use a calibration, as JSON values.
+
+    Raises CalibrationError with all ``reasons`` unless there are none or ``override`` is set.
+    """
+    if reasons and not override:
+        raise CalibrationError(
+            f"calibration {calibration.id[:12]} does not belong to these data: "
+            f"{'; '.join(reasons)}. Identify again, or override explicitly"
+        )
+    return {"calibration": calibration.id, "objections": list(reasons), "overridden": bool(reasons)}
+
+
+def _certificate(calibration: Calibration, polarity: int | None) -> list[str]:
+    certificate = calibration.certificate
+    found = []
+    verdict = certificate.get("verdict")
+    if isinstance(verdict, str) and not verdict.startswith("accepted"):
+        found.append(f"its certificate says {verdict!r}{_reasons(certificate)}")
+    certified = certificate.get("polarity")
+    if polarity is not None and certified is not None and certified != polarity:
+        found.append(f"polarity is {polarity!r}, calibrated with {certified!r}")
+    return found
+
+
+def _reasons(certificate: Mapping[str, object]) -> str:
+    reasons = certificate.get("reasons")
+    return f" ({'; '.join(map(str, reasons))})" if isinstance(reasons, list) and reasons else ""
+
+
+def _differences(then: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    found = []
+    for name, value in sorted(then.items()):
+        if name not in now:
+            found.append(f"{name} is not known, calibrated with {value!r}")
+        elif not _same(value, now[name]):
+            found.append(f"{name} is {now[name]!r}, calibrated with {value!r}")
+    return found
+
+
+def _same(one: object, other: object) -> bool:
+    if _is_number(one) and _is_number(other):
+        return bool(np.isclose(one, other, rtol=_SAME_VALUE, atol=0.0))  # type: ignore[call-overload]
+    return one == other
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,296 @@
+"""What is the surface's height, free of the machine's dynamics?
+
+``height = H(z) + polarity · distance / static_gain`` (Eq. 10, 13), with H the discretised G_m
+run over the encoder's stream. The probe's dropouts cost their own points only. A stream may
+be cut into blocks anywhere and the two be interleaved anyhow: the points are the same to
+the last bit, live and offline.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.correction.motion_filter import ABSURD, MotionFilter, MotionFilters
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER
+from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.samples.accounts import Account, Reason, Tally
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.continuity import Arrival, TriggerCount
+from omsm_ros.core.samples.pairing import Pairing, Run
+from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.units import NANOSECONDS_PER_S
+
+SAME_PERIOD = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionOptions:
+    """How to correct.
+
+    polarity: 1 if the distance falls when z rises, -1 for a probe mounted the other way
+    static_gain: probe travel per encoder travel [1]; None takes the calibration's
+    accept_other_rate: correct data of another sample period than the calibration's
+    max_pending: how long a sample waits for its partner [s]; the newest block always may
+    sources: other uncertainties; None takes what the calibration's certificate tells
+    lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
+        None takes the calibration's lag if its settings say ``lag_is_latency``
+    geometry: where the probe sits and looks
+    interpolation: order of the polynomial between samples, 1 to 7
+    """
+
+    polarity: int = 1
+    static_gain: float | None = None
+    accept_other_rate: bool = False
+    max_pending: float = 10.0
+    sources: ErrorSources | None = None
+    lateral_lag: float | None = None
+    geometry: Geometry = field(default_factory=Geometry)
+    interpolation: int = DEFAULT_ORDER
+
+    def __post_init__(self) -> None:
+        if self.polarity not in (1, -1):
+            raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
+        if self.static_gain is not None and not 0 < self.static_gain < np.inf:
+            raise ConfigurationError(f"static_gain {self.static_gain!r}, expected None or positive")
+        if not 0 < self.max_pending < np.inf:
+            raise ConfigurationError(f"max_pending {self.max_pending!r} s, expected positive")
+        if self.lateral_lag is not None and not 0 <= self.lateral_lag < np.inf:
+            raise ConfigurationError(
+                f"lateral_lag {self.lateral_lag!r} s, expected None, zero or a positive number"
+            )
+
+
+class Corrector:
+    """Turns axis and distance blocks into surface points, in the order of their triggers.
+
+    Push the two streams about as they came: what waits longer than ``max_pending`` for its
+    partner is given up, so that memory stays bounded. Each may also come as one block.
+    """
+
+    def __init__(
+        self, calibration: Calibration, options: CorrectionOptions = CorrectionOptions()
+    ) -> None:
+        self._calibration = calibration
+        self._options = options
+        self._static_gain = options.static_gain or calibration.static_gain
+        self._sources = options.sources or ErrorSources.of(calibration)
+        self._period: float | None = None
+        self._axes_tally, self._distance_tally = Tally(), Tally()
+        self._axes_count, self._distance_count = TriggerCount(), TriggerCount()
+        self._pairing = Pairing(self._axes_tally, self._distance_tally)
+        self._motion: MotionFilter | None = None
+        self._noise_gain = 1.0
+        self._variance: defaultdict[str, float] = defaultdict(float)
+        self._ready: list[SurfacePoints] = []
+        self._stamp_skew: float | None = None
+
+    def push_axes(self, block: AxisBlock) -> None:
+        """Filter the encoder's samples of a block.
+
+        Raises CalibrationError for a sample period the calibration does not hold for.
+        """
+        motion = self._filter_for(block)
+        admission = _admit(self._axes_count, block, self._axes_tally)
+        if admission.skip < len(block):
+            for run in motion.push(_axes_run(block, admission)):
+                self._pairing.axes.push(run)
+            self._join()
+            self._pairing.axes.limit(self._most_pending(block))
+
+    def push_distance(self, block: DistanceBlock) -> None:
+        """Queue the probe's readings of a block.
+
+        Raises CalibrationError for a sample period the calibration does not hold for.
+        """
+        self._filter_for(block)
+        admission = _admit(self._distance_count, block, self._distance_tally)
+        if admission.skip < len(block):
+            self._pairing.distance.push(_distance_run(block, admission))
+            self._join()
+            self._pairing.distance.limit(self._most_pending(block))
+
+    def _most_pending(self, newest: AxisBlock | DistanceBlock) -> int:
+        return max(int(self._options.max_pending / newest.sample_period), len(newest))
+
+    def take(self) -> SurfacePoints | None:
+        """Points completed since the last call, None if there are none."""
+        if not self._ready:
+            return None
+        points = self._ready[0] if len(self._ready) == 1 else join_points(self._ready)
+        self._ready = []
+        return points
+
+    def finish(self) -> SurfacePoints | None:
+        """End both streams and take what is left; what comes later begins a new session."""
+        if self._motion is not None:
+            for run in self._motion.end():
+                self._pairing.axes.push(run)
+        self._join()
+        for queue in (self._pairing.axes, self._pairing.distance):
+            queue.clear()
+        for sequence in (self._axes_count, self._distance_count):
+            sequence.end()
+        return self.take()
+
+    @property
+    def account(self) -> Account:
+        """Where every sample received so far has gone."""
+        warming = self._motion.pending if self._motion else 0
+        return Account(
+            axes=self._axes_tally.snapshot(self._pairing.axes.pending + warming),
+            distance=self._distance_tally.snapshot(self._pairing.distance.pending),
+        )
+
+    @property
+    def stamp_skew(self) -> float | None:
+        """Time of the axes minus time of the distance for the newest common trigger [s].
+
+        Large or drifting, it tells of devices that count different triggers.
+        """
+        return self._stamp_skew
+
+    @property
+    def budget(self) -> dict[str, float]:
+        """Standard uncertainty of the heights by its source [m], root mean square of all points."""
+        points = max(self._axes_tally.corrected, 1)
+        return {name: float(np.sqrt(sum_ / points)) for name, sum_ in self._variance.items()}
+
+    def _filter_for(self, block: Block) -> MotionFilter:
+        period = block.sample_period
+        if self._motion is None or self._period is None:
+            self._motion = self._begin(period)
+        elif abs(period - self._period) > SAME_PERIOD * self._period:
+            raise CalibrationError(
+                f"sample period {period!r} s after blocks of {self._period!r} s; "
+                "both streams must keep one sample period"
+            )
+        return self._motion
+
+    def _begin(self, period: float) -> MotionFilter:
+        expected = self._calibration.sample_period
+        same = abs(period - expected) <= SAME_PERIOD * expected
+        if not (same or self._options.accept_other_rate):
+            raise CalibrationError(
+                f"sample period {period!r} s, but the calibration was identified at "
+                f"{expected!r} s; identify at this rate or accept another rate explicitly"
+            )
+        self._period = period
+        filters = MotionFilters.of(
+            self._calibration,
+            period,
+            lateral_lag(self._calibration, self._options),
+            self._sources.lateral_lag,
+            self._options.interpolation,
+        )
+        self._noise_gain = filters.height.noise_gain
+        return MotionFilter(filters)
+
+    def _join(self) -> None:
+        for axes, distance in self._pairing.pairs():
+            self._stamp_skew = (axes.stamp_ns - distance.stamp_ns) / NANOSECONDS_PER_S
+            points = self._points(axes, distance)
+            if len(points):
+                self._ready.append(points)
+
+    def _points(self, axes: Run, distance: Run) -> SurfacePoints:
+        sample = np.arange(axes.first, axes.end)
+        axis_values, probe_values = axes.values, distance.values
+        if axes.reasons.any() or distance.reasons.any():
+            good = (axes.reasons | distance.reasons) == Reason.NONE
+            sample = sample[good]
+            axis_values, probe_values = axis_values[:, good], probe_values[:, good]
+        x, y, b, c, moved, dynamic_error, dynamics, timing = axis_values
+        reading, intensity = probe_values
+        where = workpiece_points(
+            self._options.geometry,
+            (x, y, moved),
+            b,
+            c,
+            reading * (self._options.polarity / self._static_gain),
+        )
+        return SurfacePoints(
+            sample=sample,
+            x=where.x,
+            y=where.y,
+            height=where.height,
+            dynamic_error=dynamic_error,
+            uncertainty=self._uncertainty(reading, dynamics, timing),
+            intensity=intensity.astype(np.float32),
+        )
+
+    def _uncertainty(
+        self, reading: FloatArray, dynamics: FloatArray, timing: FloatArray
+    ) -> FloatArray:
+        variances = contributions(
+            self._sources, self._noise_gain, self._static_gain, reading, dynamics, timing
+        )
+        for name, variance in variances.items():
+            common = isinstance(variance, float)
+            self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)
+        return np.sqrt(sum(variances.values()))
+
+
+def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
+    """By how much X, Y, B and C are delayed [s]: zero unless the lag is known to be latency."""
+    if options.lateral_lag is not None:
+        return options.lateral_lag
+    stated = calibration.settings.get("lag_is_latency", False)
+    if not isinstance(stated, bool):
+        raise CalibrationError(f"settings: lag_is_latency is {stated!r}, expected true or false")
+    return max(calibration.dynamics.low_frequency_delay, 0.0) if stated else 0.0
+
+
+def _admit(sequence: TriggerCount, block: AxisBlock | DistanceBlock, tally: Tally) -> Arrival:
+    admission = sequence.place(block, len(block))
+    tally.received += len(block)
+    tally.count(Reason.LATE, admission.late)
+    tally.count(Reason.DUPLICATE, admission.skip - admission.late)
+    return admission
+
+
+def _axes_run(block: AxisBlock, admission: Arrival) -> Run:
+    values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
+    return _run(block, admission, np.zeros(len(block), np.uint8), values)
+
+
+def _distance_run(block: DistanceBlock, admission: Arrival) -> Run:
+    intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
+    usable = block.ok & (abs(block.distance) < ABSURD)
+    reasons = np.where(usable, Reason.NONE, Reason.INVALID).astype(np.uint8)
+    return _run(block, admission, reasons, np.array([block.distance, intensity], np.float64))
+
+
+def _run(block: Block, admission: Arrival, reasons: NDArray[np.uint8], values: FloatArray) -> Run:
+    period_ns = block.sample_period * NANOSECONDS_PER_S
+    whole = Run(admission.session, admission.first, block.stamp_ns, period_ns, reasons, values)
+    return whole.part(admission.skip, len(whole)) if admission.skip else whole
+
+
+def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
+    """All points of ``parts`` in their order; None counts as no points."""
+    present = [part for part in parts if part is not None] or [_NO_POINTS]
+    return SurfacePoints(
+        **{
+            f.name: np.concatenate([getattr(p, f.name) for p in present])
+            for f in fields(_NO_POINTS)
+        }
+    )
+
+
+_NO_POINTS = SurfacePoints(
+    sample=np.empty(0, np.int64),
+    x=np.empty(0),
+    y=np.empty(0),
+    height=np.empty(0),
+    dynamic_error=np.empty(0),
+    uncertainty=np.empty(0),
+    intensity=np.empty(0, np.float32),
+)

@@ -1,0 +1,170 @@
+"""What did the probe's own motion look like, sample by sample?
+
+H runs over the encoder's stream alone. It starts in the steady state of the motion it finds,
+and starts anew after every interruption: a gap in the trigger count, or an axis that gives
+no number. The samples in which a wrong start would still be felt are marked as settling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.correction.uncertainty import derivative_filter, sensitivity_filters
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
+from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.accounts import Reason
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.pairing import Run
+
+# The share of a wrong start that may be left in the first published point.
+SETTLED = 1e-6
+_MIN_START_SAMPLES = 12
+_X, _Y, _Z, _B, _C = range(5)
+_LATERAL = (_X, _Y, _B, _C)
+_OUTPUTS = 8
+# No length [m] and no angle [rad] is this large; such numbers would overflow on the way.
+ABSURD = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class MotionFilters:
+    """The filters that run over the axes.
+
+    height: H on z;  dynamics: F_r on z, variance of H(z) from the covariance
+    timing: on z, H(z) per unit standard uncertainty of the sideways lag
+    lateral: on x, y, b, c, where the lag is latency; None where it is not
+    """
+
+    height: DigitalFilter
+    dynamics: list[DigitalFilter]
+    timing: DigitalFilter | None
+    lateral: DigitalFilter | None
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        sample_period: float,
+        lateral_lag: float = 0.0,
+        lateral_lag_uncertainty: float = 0.0,
+        order: int = DEFAULT_ORDER,
+    ) -> MotionFilters:
+        """The filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
+        g = calibration.dynamics
+        rate = np.append(0.0, g.numerator) * lateral_lag_uncertainty
+        timing = None
+        if lateral_lag_uncertainty > 0:
+            timing = derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles())
+        delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
+        return cls(
+            height=discretise(g, sample_period, order),
+            dynamics=sensitivity_filters(calibration, sample_period),
+            timing=timing,
+            lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
+        )
+
+    def settling_samples(self) -> int:
+        """Samples until a wrong start is forgotten to ``SETTLED`` of itself."""
+        used = [self.height] if self.lateral is None else [self.height, self.lateral]
+        return max(f.settling_samples(SETTLED) for f in used)
+
+
+class MotionFilter:
+    """Turns runs of axis channels x, y, z, b, c into runs of
+
+    x, y, b, c, H(z), z - H(z), and the variance of H(z) from dynamics and from timing.
+    """
+
+    def __init__(self, filters: MotionFilters) -> None:
+        self._height = Recursion(filters.height)
+        self._dynamics = [Recursion(f) for f in filters.dynamics]
+        self._timing = Recursion(filters.timing) if filters.timing else None
+        self._lateral = (
+            {axis: Recursion(filters.lateral) for axis in _LATERAL} if filters.lateral else {}
+        )
+        settling = filters.settling_samples()
+        self._start_samples = max(settling // 2, _MIN_START_SAMPLES)
+        self._settling = max(settling, self._start_samples)
+        self._unsettled = self._settling
+        self._next: tuple[int, int] | None = None
+        self._waiting: list[Run] = []
+
+    @property
+    def pending(self) -> int:
+        """Samples that wait until there are enough to start on."""
+        return sum(map(len, self._waiting))
+
+    def push(self, run: Run) -> list[Run]:
+        """Filter a run that follows the last one or comes after a gap."""
+        done = [] if (run.session, run.first) == self._next else self.end()
+        self._next = (run.session, run.end)
+        finite: BoolArray = np.all(abs(run.values) < ABSURD, axis=0)
+        if finite.all():
+            return done + self._push_finite(run)
+        edges = np.flatnonzero(np.diff(finite)) + 1
+        for start, stop in zip([0, *edges], [*edges, len(run)], strict=True):
+            piece = run.part(int(start), int(stop))
+            if finite[start]:
+                done += self._push_finite(piece)
+            else:
+                done += [*self._break(), _unfiltered(piece, Reason.INVALID)]
+        return done
+
+    def end(self) -> list[Run]:
+        """The stream ends here: what was too short to start on comes out as settling."""
+        self._next = None
+        return self._break()
+
+    def _break(self) -> list[Run]:
+        short, self._waiting = self._waiting, []
+        self._unsettled = self._settling
+        return [_unfiltered(run, Reason.SETTLING) for run in short]
+
+    def _push_finite(self, run: Run) -> list[Run]:
+        if self._unsettled < self._settling:
+            return [self._filtered(run)]
+        self._waiting.append(run)
+        if self.pending < self._start_samples:
+            return []
+        waiting, self._waiting = self._waiting, []
+        self._start(np.concatenate([w.values for w in waiting], axis=1)[:, : self._start_samples])
+        return [self._filtered(w) for w in waiting]
+
+    def _start(self, first: FloatArray) -> None:
+        motion = past_motion(first[_Z].copy())
+        for recursion in (self._height, *self._dynamics, *filter(None, [self._timing])):
+            recursion.start(motion)
+        for axis, recursion in self._lateral.items():
+            recursion.start(past_motion(first[axis].copy()))
+
+    def _filtered(self, run: Run) -> Run:
+        z = run.values[_Z]
+        out = np.zeros((_OUTPUTS, len(run)))
+        for row, axis in enumerate(_LATERAL):
+            samples = run.values[axis]
+            out[row] = self._lateral[axis].run(samples) if self._lateral else samples
+        out[4] = self._height.run(z)
+        out[5] = z - out[4]
+        for recursion in self._dynamics:
+            out[6] += recursion.run(z) ** 2
+        if self._timing:
+            out[7] = self._timing.run(z) ** 2
+        reasons = np.zeros(len(run), np.uint8)
+        reasons[: self._unsettled] = Reason.SETTLING
+        self._unsettled = max(self._unsettled - len(run), 0)
+        return Run(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
+
+
+def _unfiltered(run: Run, reason: Reason) -> Run:
+    return Run(
+        run.session,
+        run.first,
+        run.stamp_ns,
+        run.period_ns,
+        np.full(len(run), reason, np.uint8),
+        np.full((_OUTPUTS, len(run)), np.nan),
+    )

@@ -1,0 +1,208 @@
+"""How well is each height known? (GUM, first order, k = 1)
+
+``height = H(z) + distance / g``. The parameters of G carry their covariance through the
+filter: with Σ = L Lᵀ the variance of H(z) is ``Σ_r |F_r z|²``, where ``F_r = Σ_j L_jr ∂G/∂θ_j``
+is again a transfer function. A sideways lag that is wrong by δ moves the point along the
+path; where Z follows the surface that costs ``δ dH(z)/dt`` of height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discretise
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
+from omsm_ros.units import MICROMETRE_M
+
+# A direction of the covariance that adds less than this share of the variance is left out.
+_NEGLIGIBLE = 1e-6
+# Sensitivities are derivatives of the motion: each costs one order of the interpolation.
+_ORDER = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorSources:
+    """Standard uncertainties besides that of the dynamics.
+
+    probe_noise: of a reading [m];  probe_resolution: step of a reading [m]
+    encoder_noise: of z [m];  encoder_resolution: step of z [m]
+    static_gain: of the calibration's static gain [1]
+    lateral_lag: of the sideways lag [s]; it shifts the points along the path
+    discretisation: of H against G on this motion [m]
+    abbe: of z by pitch of the slide over its Abbe arm [m]
+    """
+
+    probe_noise: float = 0.0
+    probe_resolution: float = 0.0
+    encoder_noise: float = 0.0
+    encoder_resolution: float = 0.0
+    static_gain: float = 0.0
+    lateral_lag: float = 0.0
+    discretisation: float = 0.0
+    abbe: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ConfigurationError(
+                    f"uncertainty {field.name} is {value!r}, expected zero or a positive number"
+                )
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> ErrorSources:
+        """What the calibration's certificate tells; what it does not tell counts as zero.
+
+        Its noise is that of readings at rest, so it holds the probe's resolution already.
+        """
+        return cls(
+            probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
+            static_gain=_standard_uncertainty(calibration.certificate, "static_gain_uncertainty"),
+        )
+
+
+def sources_with(calibration: Calibration, stated: Mapping[str, object]) -> ErrorSources:
+    """The sources the calibration tells of, those ``stated`` by name in their place.
+
+    Raises ConfigurationError for a name that is no source, or a value that is no uncertainty.
+    """
+    known = [field.name for field in fields(ErrorSources)]
+    for name, value in stated.items():
+        if name not in known:
+            raise ConfigurationError(f"uncertainty {name!r} is unknown, expected of {known}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigurationError(f"uncertainty {name} is {value!r}, expected a number in SI")
+    return replace(ErrorSources.of(calibration), **stated)  # type: ignore[arg-type]
+
+
+def _standard_uncertainty(certificate: Mapping[str, object], key: str) -> float:
+    value = certificate.get(key, 0.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
+        raise CalibrationError(
+            f"certificate: {key} is {value!r}, expected zero or a positive number"
+        )
+    return float(value)
+
+
+def contributions(
+    sources: ErrorSources,
+    noise_gain: float,
+    static_gain: float,
+    distance: FloatArray,
+    dynamics: FloatArray,
+    timing: FloatArray,
+) -> dict[str, FloatArray | float]:
+    """Variances of the heights [m²] by their source, each (n,) or the same for all points.
+
+    noise_gain: of H for white noise;  distance: readings [m], (n,)
+    dynamics, timing: variance of H(z) from the covariance and from the sideways lag, (n,)
+    """
+    scale = sources.static_gain / static_gain**2
+    return {
+        "dynamics": dynamics,
+        "lateral_lag": timing,
+        "static_gain": (scale * distance) ** 2,
+        "probe_noise": (sources.probe_noise / static_gain) ** 2,
+        "probe_resolution": (sources.probe_resolution / static_gain) ** 2 / 12,
+        "encoder_noise": (noise_gain * sources.encoder_noise) ** 2,
+        "encoder_resolution": (noise_gain * sources.encoder_resolution) ** 2 / 12,
+        "discretisation": sources.discretisation**2,
+        "abbe": sources.abbe**2,
+    }
+
+
+def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> SurfacePoints:
+    """The points with ``lateral`` [m], their standard uncertainty sideways, times the slope.
+
+    The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
+    """
+    step = 10 * MICROMETRE_M
+    x, y = points.x, points.y
+    slope_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
+    slope_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
+    variance = points.uncertainty**2 + lateral**2 * (slope_x**2 + slope_y**2)
+    return replace(points, uncertainty=np.sqrt(variance))
+
+
+def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[DigitalFilter]:
+    """Filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none if the covariance is zero."""
+    g = calibration.dynamics
+    square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
+    combined = sensitivity_numerators(calibration)
+    band = 2j * np.pi * np.linspace(0.0, calibration.valid_up_to, 64)
+    power = np.abs(polynomial.polyval(band, combined.T)) ** 2
+    share = power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny)
+    return [
+        derivative_filter(numerator, square, g.delay, sample_period, np.tile(g.poles(), 2))
+        for numerator, largest in zip(combined, share.max(axis=1), strict=True)
+        if largest > _NEGLIGIBLE
+    ]
+
+
+def derivative_filter(
+    numerator: FloatArray,
+    denominator: FloatArray,
+    delay: float,
+    sample_period: float,
+    poles: ComplexArray,
+) -> DigitalFilter:
+    """A filter for a ratio whose numerator may exceed the denominator by one degree.
+
+    Such a ratio, the derivative of a response that does not fall, gets a pole above the
+    Nyquist frequency: below a tenth of it that is 1 % of magnitude. Where a resonance folds
+    to slow motion the bilinear transform, which does not fold, serves better here.
+    """
+    used = np.trim_zeros(numerator, "b")
+    if len(used) > len(denominator):
+        fast = np.array([1.0, sample_period / 4])
+        denominator = np.asarray(polynomial.polymul(denominator, fast), np.float64)
+        poles = np.append(poles, -4 / sample_period)
+    ratio = TransferFunction(used, denominator, delay)
+    try:
+        return discretise(ratio, sample_period, _ORDER, poles)
+    except DataError:
+        return bilinear(ratio, sample_period, poles)
+
+
+def sensitivity_numerators(calibration: Calibration) -> FloatArray:
+    """F_r times denominator², ascending powers of s, one row a direction of the covariance."""
+    g = calibration.dynamics
+    per_parameter = _sensitivity_numerators(g.numerator, g.denominator)
+    return np.asarray(_factor(calibration.covariance).T @ per_parameter, np.float64)
+
+
+def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """∂G/∂θ_j times denominator², ascending powers of s, one row a parameter."""
+    m, n = len(numerator) - 1, len(denominator) - 1
+    rows = np.zeros((m + n + 2, max(2 * n, m + n + 1) + 1))
+    for i in range(m + 1):
+        rows[i, i : i + n + 1] = denominator
+    for i in range(1, n + 1):
+        rows[m + i, i : i + m + 1] = -numerator
+    rows[-1, 1 : m + n + 2] = -polynomial.polymul(numerator, denominator)
+    return rows
+
+
+def _factor(covariance: FloatArray) -> FloatArray:
+    """L with L Lᵀ = covariance, (p, rank); scaled first, for the variances span many decades.
+
+    Raises CalibrationError for a covariance with a negative eigenvalue.
+    """
+    deviations = np.sqrt(np.diag(covariance))
+    free = np.flatnonzero(deviations)
+    correlation = covariance[np.ix_(free, free)] / np.outer(deviations[free], deviations[free])
+    values, vectors = np.linalg.eigh(correlation)
+    if len(values) and values[0] < -1e-6:
+        raise CalibrationError(f"covariance has a negative eigenvalue, {values[0]!r} (scaled)")
+    factor = np.zeros((len(covariance), len(free)))
+    factor[free] = deviations[free, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return factor

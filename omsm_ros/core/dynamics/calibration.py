@@ -1,0 +1,120 @@
+"""A calibration: the identified dynamics, how well they are known, and what they belong to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import CalibrationError, OmsmError
+
+SCHEMA = "omsm-calibration/1"
+REJECTED = "rejected"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration:
+    """G_m with its covariance and the settings it was measured under.
+
+    dynamics: G_m(s), fitted with G_m(0) = 1
+    static_gain: probe travel per encoder travel at rest [1]; the corrector divides the
+        probe's distance by it, for the encoder is the length standard
+    sample_period: of the data it was identified from [s]
+    valid_up_to: highest frequency at which the response is trusted [Hz]
+    covariance: (p, p), order numerator, denominator[1:], delay; zero rows for fixed parameters
+    settings: probe rate, exposure, averaging, machine, fixture …; JSON values
+    certificate: how it was obtained and the verdict; JSON values
+
+    Raises CalibrationError when the parts do not fit each other.
+    """
+
+    dynamics: TransferFunction
+    static_gain: float
+    sample_period: float
+    valid_up_to: float
+    covariance: FloatArray
+    settings: Mapping[str, object] = field(default_factory=dict)
+    certificate: Mapping[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        p = len(self.dynamics.numerator) + len(self.dynamics.denominator)
+        if self.covariance.shape != (p, p) or not np.all(np.isfinite(self.covariance)):
+            raise CalibrationError(
+                f"covariance of shape {self.covariance.shape!r}, expected ({p}, {p}) finite numbers"
+            )
+        scale = np.sqrt(np.outer(np.diag(self.covariance), np.diag(self.covariance)))
+        if np.any(np.diag(self.covariance) < 0) or np.any(
+            abs(self.covariance - self.covariance.T) > 1e-9 * scale
+        ):
+            raise CalibrationError("covariance is not symmetric with a diagonal of variances")
+        if not self.dynamics.is_stable:
+            raise CalibrationError(
+                f"G_m is unstable: poles {self.dynamics.poles()!r}; identify it again"
+            )
+        for name in ("static_gain", "sample_period", "valid_up_to"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise CalibrationError(f"{name} is {value!r}, expected a positive number")
+
+    def content(self) -> dict[str, object]:
+        """The calibration as JSON values, without its id."""
+        return {
+            "schema": SCHEMA,
+            "numerator": self.dynamics.numerator.tolist(),
+            "denominator": self.dynamics.denominator.tolist(),
+            "delay": float(self.dynamics.delay),
+            "static_gain": float(self.static_gain),
+            "sample_period": float(self.sample_period),
+            "valid_up_to": float(self.valid_up_to),
+            "covariance": self.covariance.ravel().tolist(),
+            "settings": dict(self.settings),
+            "certificate": dict(self.certificate),
+        }
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> Calibration:
+        """The inverse of :meth:`content`, for values already checked against the schema."""
+        try:
+            dynamics = TransferFunction(
+                np.asarray(content["numerator"], np.float64),
+                np.asarray(content["denominator"], np.float64),
+                float(content["delay"]),
+            )
+        except OmsmError as err:
+            raise CalibrationError(str(err)) from err
+        p = len(dynamics.numerator) + len(dynamics.denominator)
+        covariance = np.asarray(content["covariance"], np.float64)
+        return cls(
+            dynamics=dynamics,
+            static_gain=float(content["static_gain"]),
+            sample_period=float(content["sample_period"]),
+            valid_up_to=float(content["valid_up_to"]),
+            covariance=covariance.reshape(p, p) if covariance.size == p * p else covariance,
+            settings=content["settings"],
+            certificate=content["certificate"],
+        )
+
+    @cached_property
+    def id(self) -> str:
+        """SHA-256 over the canonical content, hexadecimal."""
+        return content_id(self.content())
+
+
+def verdict_of(calibration: Calibration) -> tuple[str, list[str]]:
+    """Verdict of the certificate, empty if it has none, and its reasons."""
+    reasons = calibration.certificate.get("reasons")
+    texts = [str(reason) for reason in reasons] if isinstance(reasons, list) else []
+    return str(calibration.certificate.get("verdict", "")), texts
+
+
+def content_id(content: Mapping[str, object]) -> str:
+    """SHA-256 of the canonical JSON of ``content``: sorted keys, shortest exact numbers."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()

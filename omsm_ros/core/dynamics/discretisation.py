@@ -1,0 +1,151 @@
+"""How does a continuous G(s) act on samples?
+
+Between samples the encoder's motion is smooth, so it is taken as the polynomial through
+the newest ``order + 1`` samples, and the differential equation of G is integrated exactly
+over it. Poles are mapped by exp(pT): one far above the Nyquist frequency becomes a
+response within the sample, where the bilinear transform would make it ring at Nyquist.
+The pure delay is a Lagrange interpolator of the same order. At 0 Hz the gain is G(0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import signal
+
+from omsm_ros.core.dynamics.polynomial_hold import held_zeros
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError, DataError
+
+DEFAULT_ORDER = 3
+# Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.
+_MATCHED_RAD = 0.02
+_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class DigitalFilter:
+    """Second-order ``sections`` (k, 6) as in scipy, for samples every ``sample_period`` [s]."""
+
+    sections: FloatArray
+    sample_period: float
+
+    def response(self, frequency: FloatArray) -> ComplexArray:
+        """H at ``frequency`` [Hz], of the same shape."""
+        backward = np.exp(-2j * np.pi * np.asarray(frequency) * self.sample_period)
+        result = np.ones_like(backward)
+        for section in self.sections:
+            result = result * polynomial.polyval(backward, section[:3])
+            result = result / polynomial.polyval(backward, section[3:])
+        return np.asarray(result, np.complex128)
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        """Poles in the z plane, shape (2k,)."""
+        return np.concatenate([np.roots(section[3:]) for section in self.sections])
+
+    def settling_samples(self, tolerance: float) -> int:
+        """Samples until a wrong start is forgotten to ``tolerance`` of itself."""
+        slowest = float(max(abs(self.poles)))
+        recursive = np.log(tolerance) / np.log(slowest) if slowest > 0 else 0.0
+        return int(np.ceil(recursive)) + 2 * len(self.sections)
+
+    @cached_property
+    def noise_gain(self) -> float:
+        """Standard deviation out per standard deviation in, for white noise."""
+        pulse = np.zeros(self.settling_samples(1e-9) + 1)
+        pulse[0] = 1.0
+        return float(np.linalg.norm(signal.sosfilt(self.sections, pulse)))
+
+
+def discretise(
+    dynamics: TransferFunction,
+    sample_period: float,
+    order: int = DEFAULT_ORDER,
+    poles: ComplexArray | None = None,
+) -> DigitalFilter:
+    """Integrate ``dynamics`` over the polynomial of ``order`` through the newest samples.
+
+    poles: of ``dynamics`` [rad/s], where they are known better than from its coefficients
+
+    Raises ConfigurationError for an order outside 1 to 7 or a sample_period that is not
+    positive, DataError for dynamics that samples this far apart cannot represent.
+    """
+    if not 1 <= order <= 7:
+        raise ConfigurationError(f"interpolation order {order!r}, expected 1 to 7")
+    if not (np.isfinite(sample_period) and sample_period > 0):
+        raise ConfigurationError(f"sample_period {sample_period!r} s, expected a positive number")
+    continuous = (dynamics.poles() if poles is None else poles) * sample_period
+    at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
+    zeros = held_zeros(dynamics.zeros() * sample_period, continuous, order, at_rest)
+    discrete = np.append(np.exp(continuous), np.zeros(order if len(continuous) else 0))
+    late, delay_zeros = _lagrange_delay(dynamics.delay / sample_period, order)
+    late += len(discrete) - len(zeros)
+    zeros = np.concatenate([zeros, delay_zeros])
+    discrete = np.append(discrete, np.zeros(len(delay_zeros)))
+    gain = _gain(dynamics, sample_period, zeros, discrete, late)
+    digital = DigitalFilter(_sections(zeros, discrete, gain, late), sample_period)
+    return _checked(digital, dynamics)
+
+
+def _checked(digital: DigitalFilter, dynamics: TransferFunction) -> DigitalFilter:
+    """Slow motion shows a resonance that folds to it, and roots that rounding has moved."""
+    slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * digital.sample_period)
+    if not np.allclose(digital.response(slow), dynamics.response(slow), rtol=_TOLERANCE, atol=0.0):
+        raise DataError(
+            f"sampled every {digital.sample_period!r} s, a transfer function with poles "
+            f"{dynamics.poles()!r} rad/s would be off by more than {_TOLERANCE:.0%} even for slow "
+            "motion; sample faster or identify a lower order"
+        )
+    return digital
+
+
+def _gain(
+    dynamics: TransferFunction,
+    sample_period: float,
+    zeros: ComplexArray,
+    poles: ComplexArray,
+    late: int,
+) -> float:
+    """The factor that makes H equal to G at 0 Hz, or close to 0 where G(0) = 0."""
+    angle = 0.0 if dynamics.dc_gain != 0 else _MATCHED_RAD
+    z = np.exp(1j * angle)
+    monic = np.prod(1 - zeros / z) / np.prod(1 - poles / z) * z**-late
+    wanted = dynamics.response(np.array([angle / (2 * np.pi * sample_period)]))[0]
+    return float(np.real(wanted / monic))
+
+
+def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
+    """Second-order sections of ``late`` whole samples of delay and Π(1 - z_i/z) / Π(1 - p_i/z)."""
+    pairs, single = divmod(late, 2)
+    delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
+    # zpk2sos counts zeros and poles alike: what it pads lies at the origin, a factor of 1 here.
+    return np.vstack([signal.zpk2sos(zeros, poles, gain), *np.reshape(delays, (-1, 1, 6))])
+
+
+def bilinear(
+    dynamics: TransferFunction, sample_period: float, poles: ComplexArray | None = None
+) -> DigitalFilter:
+    """The bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
+    leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
+    roots = dynamics.poles() if poles is None else poles
+    zpk = signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
+    return DigitalFilter(np.asarray(signal.zpk2sos(*zpk)), sample_period)
+
+
+def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
+    """A delay of ``delay`` samples: leading whole samples, and zeros of the interpolator."""
+    if delay == 0:
+        return 0, np.empty(0, np.complex128)
+    whole = max(int(np.floor(delay)) - (order - 1) // 2, 0)
+    nodes = np.arange(order + 1)
+    taps = np.array(
+        [np.prod([(delay - whole - k) / (j - k) for k in nodes if k != j]) for j in nodes]
+    )
+    taps = np.where(abs(taps) < 1e-12, 0.0, taps)
+    first = int(np.flatnonzero(taps)[0])
+    return whole + first, np.asarray(np.roots(np.trim_zeros(taps)), np.complex128)

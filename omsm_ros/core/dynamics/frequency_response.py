@@ -1,0 +1,82 @@
+"""What frequencies a signal holds, and how one signal answers another, without a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """One-sided power spectral density, each (k,): frequency [Hz], density [unit²/Hz]."""
+
+    frequency: FloatArray
+    density: FloatArray
+
+    def rms_between(self, low: float, high: float) -> float:
+        """rms of the content from ``low`` to ``high`` [Hz], in the signal's unit."""
+        inside = (self.frequency >= low) & (self.frequency <= high)
+        step = self.frequency[1] - self.frequency[0]
+        return float(np.sqrt(np.sum(self.density[inside]) * step))
+
+    def strongest(self) -> float:
+        """Frequency [Hz] of the greatest density above zero frequency."""
+        return float(self.frequency[1:][np.argmax(self.density[1:])])
+
+
+def power_spectrum(values: FloatArray, sample_period: float, segment: int = 1024) -> Spectrum:
+    """Welch's estimate of ``values`` (n,), the mean of each segment removed.
+
+    Raises DataError for fewer than eight samples or one that is not finite.
+    """
+    if len(values) < 8 or not np.all(np.isfinite(values)):
+        raise DataError(
+            f"spectrum of {len(values)!r} samples, {int(np.sum(~np.isfinite(values)))!r} of them "
+            "not finite: at least 8 finite samples are needed"
+        )
+    frequency, density = signal.welch(
+        values, 1 / sample_period, nperseg=min(segment, len(values)), detrend="constant"
+    )
+    return Spectrum(frequency, density)
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """A response estimated without a model, arrays (k,).
+
+    frequency: [Hz];  coherence: 0-1;  uncertainty: standard, relative
+    """
+
+    frequency: FloatArray
+    response: ComplexArray
+    coherence: FloatArray
+    uncertainty: FloatArray
+
+
+def frequency_response(
+    motion: FloatArray, seen: FloatArray, sample_period: float, segment: int
+) -> FrequencyResponse:
+    """H1 = S_yu / S_uu by Welch's method with segments of ``segment`` samples, on increments.
+
+    Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
+    that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
+    """
+    du, dy = np.diff(motion), np.diff(seen)
+    rate = 1 / sample_period
+    options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
+    frequency, cross = signal.csd(du, dy, **options)
+    _, inward = signal.welch(du, **options)
+    _, coherence = signal.coherence(du, dy, **options)
+    count = max(2 * len(du) / options["nperseg"] - 1, 1.0)
+    inside = np.clip(coherence, 1e-12, 1.0)
+    uncertainty = np.sqrt((1 - inside) / (2 * inside * count))
+    tiny = np.finfo(np.float64).tiny
+    return FrequencyResponse(
+        frequency, np.asarray(cross / np.maximum(inward, tiny)), coherence, uncertainty
+    )

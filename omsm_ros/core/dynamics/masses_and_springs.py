@@ -1,0 +1,219 @@
+"""The machine as masses, springs and dampers: the paper's Eq. 6 and 7, and their fit to a G(s).
+
+Two masses in a chain from the ground: ``m1`` on ``k1, c1``, and ``m2`` on ``m1`` through
+``k2, c2``, driven by a force on ``m1``. Eq. 7 is the motion of ``m2`` (non-collocated); of
+``m1`` itself it is the collocated one. Its printed ``a1 = (k1 + k2) c1`` does not follow
+from the equations of motion, and is unstable for ordinary machines; it is
+``a1 = k1 c2 + k2 c1``. A response says nothing of the scale of masses and stiffnesses
+together, so one of them has to be known, ``m1``, or taken as the unit of the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg, optimize, signal
+
+from omsm_ros.core.dynamics.response_band import relative_response_jacobian
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import DataError, IdentificationError
+
+# What a fit finds, in the order of its uncertainties; m1 is given.
+FITTED = ("m2", "k1", "k2", "c1", "c2")
+_LINES = 200
+# Natural logarithm of how far from its guess a mass or a spring may come out.
+_SEARCHED = 8.0
+# In ln of the gain: less is rounding.
+_LEAST_PROMINENCE = 1e-6
+# Of the stated uncertainty, where no coefficient could follow the model.
+_UNSTATED = 0.1
+# The six guesses race for this many steps; the best of them is followed to its end.
+_RACE_EVALUATIONS = 8
+
+
+@dataclass(frozen=True)
+class TwoMass:
+    """m1, m2 [kg];  k1, k2 [N/m];  c1, c2 [N·s/m]; all positive."""
+
+    m1: float
+    m2: float
+    k1: float
+    k2: float
+    c1: float
+    c2: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise DataError(f"two-mass model: {name} is {value!r}, expected a positive number")
+
+    def _denominator(self) -> list[float]:
+        m1, m2, k1, k2, c1, c2 = self.m1, self.m2, self.k1, self.k2, self.c1, self.c2
+        return [
+            k1 * k2,
+            k1 * c2 + k2 * c1,
+            (m1 + m2) * k2 + m2 * k1 + c1 * c2,
+            (m1 + m2) * c2 + m2 * c1,
+            m1 * m2,
+        ]
+
+    def non_collocated(self) -> TransferFunction:
+        """Eq. 7 scaled to G(0) = 1: the probe's mass, m2."""
+        return TransferFunction.from_ascending([self.k2, self.c2], self._denominator()).normalised()
+
+    def collocated(self) -> TransferFunction:
+        """The driven mass, m1, scaled to G(0) = 1."""
+        numerator = [self.k2, self.c2, self.m2]
+        return TransferFunction.from_ascending(numerator, self._denominator()).normalised()
+
+
+@dataclass(frozen=True, eq=False)
+class TwoMassFit:
+    """model: fitted;  uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
+    misfit: root of χ² per degree of freedom, of the response's difference over what is
+        stated of it; about 1 where the model is right
+    """
+
+    model: TwoMass
+    uncertainty: FloatArray
+    misfit: float
+
+
+def fit_two_mass(
+    dynamics: TransferFunction,
+    covariance: FloatArray,
+    *,
+    table_mass: float,
+    collocated: bool,
+    frequencies: ArrayLike,
+) -> TwoMassFit:
+    """Masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
+
+    covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty; a delay
+        among them is one more thing that the model has to explain
+    table_mass: m1 [kg], which no response can tell; 1 for all others relative to it
+    frequencies: lines to compare at [Hz]
+
+    Raises IdentificationError when G has fewer than two modes to explain.
+    """
+    lines = np.asarray(frequencies, np.float64)
+    oscillating = oscillations(dynamics)
+    if len(oscillating) < 2:
+        raise IdentificationError(
+            f"the two-mass model needs two oscillating modes, the response has {len(oscillating)!r}"
+        )
+    target = np.log(dynamics.response(lines))
+    jacobian = _stacked_jacobian(dynamics, lines)
+    whiten = _whitener(jacobian, covariance)
+
+    def model(logs: FloatArray) -> TwoMass:
+        return TwoMass(table_mass, *(float(v) for v in np.exp(logs)))
+
+    def residual(logs: FloatArray) -> FloatArray:
+        two = model(logs)
+        found = two.collocated() if collocated else two.non_collocated()
+        difference = np.log(found.response(lines)) - target
+        turned = np.angle(np.exp(1j * difference.imag))
+        return np.asarray(whiten @ np.concatenate([difference.real, turned]))
+
+    def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
+        box = (start - _SEARCHED, start + _SEARCHED)
+        return optimize.least_squares(
+            residual, start, x_scale="jac", bounds=box, max_nfev=evaluations
+        )
+
+    raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(oscillating, table_mass)]
+    best = descend(min(raced, key=lambda found: float(found.cost)).x, None)
+    spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
+    variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
+    return TwoMassFit(
+        model(best.x),
+        np.sqrt(np.maximum(variance, 0.0)),
+        float(np.sqrt(2 * best.cost / max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1))),
+    )
+
+
+def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArray:
+    return relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
+
+
+def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """W with Wᵀ W the inverse covariance of the response at all lines together, (k, k).
+
+    The response of a few coefficients is the same statement many times over. What it cannot
+    state at all, for it has no coefficient for it, counts ten times as much as its variance.
+    """
+    stated = jacobian @ covariance @ jacobian.T
+    variance = np.diag(stated)
+    floor = 1e-6 * float(np.max(variance)) or 1.0
+    further = _UNSTATED**2 * np.diag(np.maximum(variance, floor))
+    root = np.linalg.cholesky(stated + further)
+    return np.asarray(linalg.solve_triangular(root, np.eye(len(root)), lower=True))
+
+
+def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
+    """Frequencies of the conjugate pairs of poles [Hz], lowest first."""
+    return tuple(mode.frequency for mode in dynamics.modes() if mode.damping < 1)
+
+
+def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:
+    """Uncoupled guesses with either mode belonging to the second mass."""
+    low, high = (2 * np.pi * frequency for frequency in oscillating[:2])
+    starts = []
+    for ratio in (0.05, 0.2, 0.8):
+        for first, second in ((low, high), (high, low)):
+            m2 = ratio * table_mass
+            k1, k2 = table_mass * first**2, m2 * second**2
+            c1, c2 = 0.05 * np.sqrt(k1 * table_mass), 0.05 * np.sqrt(k2 * m2)
+            starts.append(np.log([m2, k1, k2, c1, c2]))
+    return starts
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a response looks like; Hz, NaN where it has no such point below ``up_to``.
+
+    resonance: of the highest peak of the gain, and that gain;  minimum: of the lowest dip
+    bandwidth_3db: where the gain first leaves 1 by 3 dB;  bandwidth_1_percent: by 1 %
+    """
+
+    resonance: float
+    resonance_gain: float
+    minimum: float
+    minimum_gain: float
+    bandwidth_3db: float
+    bandwidth_1_percent: float
+
+
+def shape(dynamics: TransferFunction, up_to: float) -> Shape:
+    """Read the salient points of |G| below ``up_to`` [Hz]."""
+    frequency = np.geomspace(1e-3 * up_to, up_to, 20 * _LINES)
+    gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
+    highest, lowest = _highest_peak(np.log(gain)), _highest_peak(-np.log(gain))
+
+    def point(index: int | None) -> tuple[float, float]:
+        if index is None:
+            return float("nan"), float("nan")
+        return float(frequency[index]), float(gain[index])
+
+    def leaves(inside: float) -> float:
+        outside = np.flatnonzero(np.abs(np.log(gain)) > inside)
+        return float(frequency[outside[0]]) if len(outside) else float("nan")
+
+    return Shape(
+        *point(highest), *point(lowest), leaves(np.log(10 ** (3 / 20))), leaves(-np.log(0.99))
+    )
+
+
+def finite_values(read: Shape) -> dict[str, float | None]:
+    """The fields of ``read`` as JSON values, None for NaN."""
+    return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
+
+
+def _highest_peak(values: FloatArray) -> int | None:
+    """Its place, None where there is none; at an end there is no peak."""
+    peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
+    return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -1,0 +1,82 @@
+"""How does a digital filter run over a stream that is already moving when it begins?
+
+The first samples are taken as the end of a motion of constant acceleration that has gone
+on for ever; the filter's state is the one such a motion leaves. What remains is the
+response to the difference between the true past and that polynomial.
+"""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.dynamics.discretisation import DigitalFilter
+from omsm_ros.core.samples.blocks import FloatArray
+
+# Position, velocity, acceleration.
+POLYNOMIAL_DEGREE = 2
+
+
+def past_motion(first: FloatArray) -> FloatArray:
+    """Ascending coefficients (3,) of the parabola through ``first`` (k,), k >= 3, over its index.
+
+    Least squares about the middle sample, where the fit is best conditioned, then shifted.
+    """
+    middle = (len(first) - 1) / 2
+    index = np.arange(len(first)) - middle
+    weights = np.linalg.pinv(np.vander(index, POLYNOMIAL_DEGREE + 1, increasing=True))
+    start = first[0]
+    # A sum of products with a fixed length, unlike a BLAS call, has one order of additions.
+    centred = (weights * (first - start)).sum(axis=1)
+    shifted = np.array(
+        [
+            sum(centred[j] * comb(j, k) * (-middle) ** (j - k) for j in range(k, len(centred)))
+            for k in range(len(centred))
+        ]
+    )
+    shifted[0] += start
+    return shifted
+
+
+class Recursion:
+    """A digital filter with its state; ``run`` may cut the stream anywhere."""
+
+    def __init__(self, digital: DigitalFilter) -> None:
+        self._sections = digital.sections
+        self._state = np.zeros((len(digital.sections), 2))
+
+    def start(self, motion: FloatArray) -> None:
+        """Take the state that the polynomial ``motion`` (ascending, of the index) has left.
+
+        The next sample to run is that of index 0.
+        """
+        for state, section in zip(self._state, self._sections, strict=True):
+            out = _polynomial_response(section, motion)
+            # Direct form II transposed: y = b0 x + s1; s1' = b1 x - a1 y + s2.
+            b0, b1, _, _, a1, _ = section
+            state[0] = out[0] - b0 * motion[0]
+            state[1] = out.sum() - b0 * motion.sum() - b1 * motion[0] + a1 * out[0]
+            motion = out
+
+    def run(self, samples: FloatArray) -> FloatArray:
+        """Response to ``samples`` (n,), shape (n,); bit-identical however the stream is cut."""
+        response, self._state = signal.sosfilt(self._sections, samples, zi=self._state)
+        return np.asarray(response, np.float64)
+
+
+def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
+    """Coefficients of the response of a section (6,) to an everlasting polynomial ``motion``."""
+    degree = len(motion)
+    # q(k) -> q(k - 1) is a triangular matrix acting on the coefficients of q.
+    shift = np.array(
+        [
+            [comb(j, i) * (-1.0) ** (j - i) if j >= i else 0.0 for j in range(degree)]
+            for i in range(degree)
+        ]
+    )
+    powers = (np.eye(degree), shift, shift @ shift)
+    forward = sum(b * power for b, power in zip(section[:3], powers, strict=True))
+    backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
+    return np.asarray(np.linalg.solve(backward, forward @ motion), np.float64)

@@ -1,0 +1,107 @@
+"""How well is a response known, and up to which frequency is it trusted?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.units import DEGREE_RAD
+
+# 95 % of a normal distribution.
+COVERAGE_FACTOR = 1.959964
+_MAX_NOISE_ORDER = 12
+# Octaves from one trial frequency to the next.
+_SHOWN_STEP = 1 / 24
+# Directions of the parameter space this much weaker than the strongest are lost in rounding.
+_RANK_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseLimits:
+    """Half-widths of the 95 % band within which a response is trusted: gain [1], phase [rad]."""
+
+    gain: float = 0.005
+    phase: float = 0.5 * DEGREE_RAD
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Standard uncertainty over ``frequency`` [Hz]: relative gain [1] and phase [rad], all (k,)."""
+
+    frequency: FloatArray
+    gain: FloatArray
+    phase: FloatArray
+
+
+def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray) -> FloatArray:
+    """d(ln|G|, arg G)/d(numerator, denominator[1:], delay), shape (2, k, p).
+
+    frequency: (k,) [Hz]
+    """
+    s = 2j * np.pi * np.asarray(frequency, np.float64)[:, np.newaxis]
+    up = s ** np.arange(len(dynamics.numerator)) / polynomial.polyval(s, dynamics.numerator)
+    powers = np.arange(1, len(dynamics.denominator))
+    down = -(s**powers) / polynomial.polyval(s, dynamics.denominator)
+    both = np.concatenate([up, down, -s], axis=1)
+    return np.stack([both.real, both.imag])
+
+
+def response_band(
+    dynamics: TransferFunction, covariance: FloatArray, frequency: FloatArray
+) -> Band:
+    """Standard uncertainty of gain and phase from the covariance of the coefficients (p, p)."""
+    jacobian = relative_response_jacobian(dynamics, frequency)
+    variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
+    gain, phase = np.sqrt(np.maximum(variance, 0.0))
+    return Band(np.asarray(frequency, np.float64), gain, phase)
+
+
+def widening(band: Band, other: Band, apart: ComplexArray) -> float:
+    """Least factor, not below 1, by which ``band`` has to grow to hold the whole of ``other``.
+
+    apart: ln of the other's response over that of ``band``, at the same frequencies (k,)
+    """
+    parts = ((band.gain, other.gain, apart.real), (band.phase, other.phase, apart.imag))
+    factors = [
+        (np.abs(off) / COVERAGE_FACTOR + theirs)[own > 0] / own[own > 0]
+        for own, theirs, off in parts
+    ]
+    return float(np.max(np.concatenate([[1.0], *factors])))
+
+
+def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None) -> float:
+    """Highest frequency [Hz] below which the 95 % band stays inside ``limits``; 0 if nowhere.
+
+    other: further error at the same frequencies, added to the half-width, or None
+    """
+    gain, phase = COVERAGE_FACTOR * band.gain, COVERAGE_FACTOR * band.phase
+    if other is not None:
+        gain, phase = gain + other.gain, phase + other.phase
+    outside = np.flatnonzero((gain > limits.gain) | (phase > limits.phase))
+    if len(outside) == 0:
+        return float(band.frequency[-1])
+    return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
+
+
+def shown_up_to(
+    frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
+) -> float:
+    """Highest frequency [Hz] at which the data alone would show a response off by ``limits``.
+
+    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
+    noise: mean square of the transform of the probe's noise, (k,)
+    A model extrapolates beyond it, and what it misses there shows in no residual. Taken
+    over a third of an octave: a deviation δ of G adds δ · answer, so its best estimate has
+    the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    """
+    power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
+    for centre in frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP)):
+        near = np.abs(np.log2(np.maximum(frequency, 1e-3 * centre) / centre)) <= 1 / 6
+        energy = float(np.sum(power[near]))
+        if energy * allowed > np.sqrt(0.5 * float(power[near] @ noise[near])):
+            return float(centre)
+    return 0.0

@@ -1,0 +1,1 @@
+"""Which G(s) describes a recording best: structures, fits, and the choice among them."""

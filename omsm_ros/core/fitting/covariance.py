@@ -1,0 +1,124 @@
+"""How well are the parameters of a fit known, in coloured noise?"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.samples.blocks import FloatArray
+
+_MAX_NOISE_ORDER = 12
+# Directions of the parameter space this much weaker than the strongest are lost in rounding.
+_RANK_TOLERANCE = 1e-11
+
+
+def autoregression(
+    residual: FloatArray, highest: int = _MAX_NOISE_ORDER
+) -> tuple[FloatArray, float]:
+    """Whitening filter [1, a1 …] of a residual (n,) and the variance it leaves.
+
+    By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
+    """
+    n = len(residual)
+    size = fft.next_fast_len(2 * n, real=True)
+    power = np.abs(fft.rfft(residual, size)) ** 2
+    lags = fft.irfft(power, size)[: highest + 1] / n
+    coefficients, variance = np.ones(1), float(lags[0])
+    if variance <= 0:
+        return coefficients, 0.0
+    best = (n * np.log(variance), coefficients, variance)
+    for order in range(1, min(highest, n - 1) + 1):
+        # Levinson's recursion.
+        reflection = -(coefficients @ lags[order:0:-1]) / variance
+        padded = np.append(coefficients, 0.0)
+        coefficients = padded + reflection * padded[::-1]
+        variance *= 1 - reflection**2
+        score = n * np.log(variance) + order * np.log(n)
+        if score < best[0]:
+            best = (score, coefficients, variance)
+    return np.asarray(best[1]), best[2]
+
+
+def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
+    """Variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies; white is flat."""
+    coefficients, variance = autoregression(residual)
+    return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
+
+
+def parameter_covariance(
+    problem: Problem,
+    columns: FloatArray,
+    residual: FloatArray,
+    passed: TransferFunction | None = None,
+) -> FloatArray:
+    """(q, q) covariance of the parameters of ``columns`` (k, q), coloured residual allowed.
+
+    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
+
+    passed: through which the noise of the motion comes into the residual, None if it does not.
+        A sharp resonance lifts it out of the probe's noise just where it is identified, in a
+        line too narrow for the residual to show.
+    """
+    samples, size = columns.shape
+    residual = residual * np.sqrt(samples / max(samples - size, 1))
+    on_grid = np.zeros((len(problem.used), size))
+    on_grid[problem.used] = columns
+    length = fft.next_fast_len(len(on_grid) + _MAX_NOISE_ORDER, real=True)
+    spectrum = fft.rfft(on_grid, length, axis=0)
+    weight = np.full(len(spectrum), 2.0)
+    weight[0] = 1.0
+    if length % 2 == 0:
+        weight[-1] = 1.0
+    noise = noise_spectrum(residual, length)
+    if passed is not None:
+        came = _motion_noise_spectrum(problem, passed, length)
+        noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
+    weighted = (weight * noise)[:, np.newaxis] * spectrum
+    meat = np.real(np.conj(spectrum).T @ weighted) / length
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh((columns / scale).T @ (columns / scale))
+    least = _RANK_TOLERANCE * float(values[-1])
+    strong, weak = directions[:, values > least], directions[:, values <= least]
+    bread = strong / values[values > least] @ strong.T
+    inside = bread @ (meat / np.outer(scale, scale)) @ bread
+    # Of a weak direction the data know nothing: at least as little as of the weakest strong one.
+    inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
+    covariance = inside / np.outer(scale, scale)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def gain_apart(problem: Problem, fitted: Fit) -> float:
+    """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
+    every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
+    return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
+
+
+def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
+    """Variance spectrum of what ``passed`` makes of the noise of the motion, as far as it moves."""
+    frequency = fft.rfftfreq(length, problem.period)
+    moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
+    power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2
+    return np.asarray(np.where(moves, power, 0.0))
+
+
+def hidden_motion_covariance(
+    dynamics: TransferFunction, delay_bound: float, sample_period: float
+) -> FloatArray:
+    """Covariance (p, p) of the coefficients due to motion hidden between samples.
+
+    Folded motion shifts the lag by up to ``delay_bound`` [s], and bends the response by a
+    term in s² as the folded content varies over a tenth of the sampling rate around it.
+    Either is a bound, taken as a uniform distribution: its standard deviation is 1/√3 of it.
+    """
+    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
+    directions = np.zeros((2, zeros + poles + 2))
+    bend = delay_bound * sample_period / (2 * np.pi * 0.1)
+    for row, (power, size) in enumerate(((1, delay_bound), (2, bend))):
+        if poles >= power:
+            directions[row, zeros + power] = size / np.sqrt(3)
+        elif power == 1:
+            directions[row, -1] = size / np.sqrt(3)
+    return directions.T @ directions

@@ -1,0 +1,54 @@
+"""Did the record start while something still rang? Free decays of the model's own poles.
+
+What moved before the first sample is unknown, but all that is left of it is a sum of decays
+at the poles of G. Fast ones are over before the first sample that counts; a light mode may
+ring on for a second, and a fit that takes it for an answer to the motion is biased.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.samples.blocks import FloatArray
+
+# χ² a column must explain to be taken: four sigma.
+_CLEARLY_SHOWN = 16.0
+# A decay by e to this power is over.
+_OVER = 10.0
+# Directions this much weaker than the strongest are rounding.
+_SPANNED = 1e-6
+
+
+def still_decays(
+    problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
+) -> bool:
+    """True if free decays of the poles of ``fitted`` reach into the samples that count.
+
+    at_rest: the axis is, at the start; then they have to show clearly in the residual
+    colour: power of the noise at low frequency over its mean, by which chance explains more
+    """
+    counted = np.flatnonzero(problem.used)
+    if problem.starts_moving or fitted.structure.poles == 0 or len(counted) == 0:
+        return False
+    first = float(counted[0]) * problem.period
+    if float(np.min(-fitted.dynamics.poles().real)) * first > _OVER:
+        return False
+    if not at_rest:
+        return True
+    columns = problem.free_decays(fitted)[problem.used]
+    # The fit has already taken of a decay what the parameters of the model can imitate.
+    known = problem.sensitivity(fitted)
+    basis = _orthonormal(np.column_stack([columns, known]))
+    explained = float(np.sum((basis.T @ fitted.residual) ** 2))
+    rest = fitted.sum_of_squares - explained
+    size = basis.shape[1] - known.shape[1]
+    return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    """Basis (k, r) of what ``columns`` (k, q) span, whatever their units."""
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    left, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
+    return np.asarray(left[:, values > _SPANNED * values[0]])

@@ -1,0 +1,316 @@
+"""Fit G(s) to a motion and what the probe saw of it, by the error of the output.
+
+The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
+``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is
+exact for any G and any delay as long as the encoder has nothing beyond half the sampling
+rate; :mod:`~omsm_ros.core.identification.inter_sample_bias` bounds what an edge may hide there.
+Model and data are compared in time, so a missing sample is simply not compared.
+Gain, offset and drift enter linearly and are eliminated (variable projection, Golub and
+Pereyra 1973, with Kaufman's simplification of the derivative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import fft
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+
+_RANK_TOLERANCE = 1e-12
+_RACE_EVALUATIONS = 5
+_FINISH_EVALUATIONS = 60
+_FIRST_DAMPING = 1e-3
+_INSENSITIVE = 1e-10
+_SMALLEST_STEP = 1e-9
+_LONGEST_STEP = 3.0
+_CONVERGED = 1e-4
+# The pulse before a record has this content left, as a power of e, where its band ends.
+_PULSE_END = 14.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted: ``seen`` (n,) where ``used`` (n,), from ``motion`` (n,), plus ``background``.
+
+    background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
+    rate: [rad/s] unit of s inside the fit
+    noise: standard deviation of a sample of the motion [m]
+    starts_moving: fit also free decays, of what moved before the first sample
+    """
+
+    motion: FloatArray
+    seen: FloatArray
+    used: BoolArray
+    period: float
+    background: FloatArray
+    rate: float
+    noise: float = 0.0
+    starts_moving: bool = False
+
+    @cached_property
+    def closed_length(self) -> int:
+        """Samples of one period."""
+        return len(close_period(self.motion, self.period))
+
+    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
+        closed = fft.rfft(close_period(values, self.period))
+        return np.asarray(closed, np.complex128)[: len(self.s)]
+
+    @cached_property
+    def _spectrum(self) -> ComplexArray:
+        moved = motion_spectrum(self.motion, self.period, self.noise)
+        # A decay may be faster than anything in the motion: then the whole band is needed.
+        missing = self.closed_length // 2 + 1 - len(moved)
+        return np.pad(moved, (0, missing)) if self.starts_moving else moved
+
+    @cached_property
+    def s(self) -> ComplexArray:
+        """jω / rate of the transform of the closed motion, up to its last content, (k,)."""
+        omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
+        return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
+
+    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
+        """What drives the system: spectra (k,), each with its number of numerator terms."""
+        motion = (self._spectrum, structure.zeros + 1)
+        return [motion, (self._pulse, structure.poles)] if self.starts_moving else [motion]
+
+    @cached_property
+    def _pulse(self) -> ComplexArray:
+        """Spectrum (k,) of a Gaussian that is over before the first sample.
+
+        After it, its n derivatives through n poles are as many free decays, and any of them.
+        """
+        angle = self.s.imag * self.rate
+        width = np.sqrt(2 * _PULSE_END) / max(float(angle[-1]), np.finfo(np.float64).tiny)
+        centre = -np.sqrt(2 * _PULSE_END) * width
+        return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
+
+    def free_decays(self, fitted: Fit) -> FloatArray:
+        """Free decays of the poles of ``fitted`` from before the first sample, (n, poles)."""
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
+        spectra = powers * (lag * self._pulse)
+        return np.asarray(fft.irfft(spectra, self.closed_length)[:, : len(self.motion)].T)
+
+    @cached_property
+    def _target(self) -> FloatArray:
+        return self.seen[self.used]
+
+    @cached_property
+    def _fixed(self) -> FloatArray:
+        return self.background[self.used]
+
+    def _in_time(self, spectrum: ComplexArray) -> FloatArray:
+        back = fft.irfft(spectrum, self.closed_length, axis=-1)
+        return np.asarray(back[..., : len(self.motion)][..., self.used], np.float64)
+
+    def project(self, scaled: Scaled, shape: FloatArray) -> Projection:
+        """Residual and its derivative by ψ after the linear parameters are eliminated."""
+        lag, relative = scaled.lag(shape, self.s)
+        driven = self._driven(scaled.structure, lag)
+        columns = np.column_stack([self._in_time(driven).T, self._fixed])
+        basis, triangle = np.linalg.qr(columns)
+        linear = _solve(triangle, basis.T @ self._target)
+        residual = self._target - columns @ linear
+        moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
+        jacobian = basis @ (basis.T @ moved) - moved
+        return Projection(residual, jacobian, linear)
+
+    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
+        """Spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
+        terms = [
+            self.s ** np.arange(count)[:, np.newaxis] * (lag * spectrum)
+            for spectrum, count in self.drives(structure)
+        ]
+        return np.concatenate(terms)
+
+    def output(self, fitted: Fit) -> FloatArray:
+        """What the fitted model says is seen, at every sample, (n,)."""
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        spectrum = fitted.driven @ self._driven(fitted.structure, lag)
+        moved = fft.irfft(spectrum, self.closed_length)[: len(self.motion)]
+        return np.asarray(moved + self.background @ fitted.background)
+
+    def sensitivity(self, fitted: Fit) -> FloatArray:
+        """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
+        lag, relative = fitted.scaled.lag(fitted.shape, self.s)
+        driven = self._driven(fitted.structure, lag)
+        terms = len(fitted.numerator)
+        by_numerator = fitted.gain * driven[1:terms]
+        by_shape = relative * (fitted.driven @ driven)
+        by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
+        every = np.concatenate([by_numerator, by_shape, by_gain, driven[terms:]])
+        return np.column_stack([self._in_time(every).T, self._fixed])
+
+    def bent(self, fitted: Fit) -> FloatArray:
+        """d output / d(gain, lag, curvature, further drives, background) of the response, (k, …).
+
+        That is by coefficients of 1, s and s² in front of it: any response bends like that.
+        """
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        driven = self._driven(fitted.structure, lag)
+        terms = len(fitted.numerator)
+        bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
+        return np.column_stack(
+            [self._in_time(np.concatenate([bends, driven[terms:]])).T, self._fixed]
+        )
+
+
+def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares with a triangle that may be singular to rounding."""
+    scale = np.linalg.norm(triangle, axis=0)
+    scale[scale == 0] = 1.0
+    scaled = np.linalg.lstsq(triangle / scale, right, rcond=_RANK_TOLERANCE)[0]
+    return np.asarray(scaled / scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """At one ψ: residual (k,), jacobian (k, len ψ), linear parameters (m + 1 + q,)."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    linear: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted structure.
+
+    shape: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
+    background: coefficients (q,);  residual: (k,) [m]
+    """
+
+    scaled: Scaled
+    shape: FloatArray
+    driven: FloatArray
+    background: FloatArray
+    residual: FloatArray
+
+    @property
+    def structure(self) -> Structure:
+        return self.scaled.structure
+
+    @property
+    def gain(self) -> float:
+        """Of the probe per motion at rest."""
+        return float(self.driven[0])
+
+    @property
+    def numerator(self) -> FloatArray:
+        """Scaled, (m+1,), numerator[0] = 1."""
+        return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters: of the structure, and of further drives."""
+        return self.structure.size + len(self.driven) - len(self.numerator)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return len(self.residual)
+
+    @property
+    def sum_of_squares(self) -> float:
+        """[m²]"""
+        return float(self.residual @ self.residual)
+
+    @property
+    def rms(self) -> float:
+        """Of the residual [m]."""
+        return float(np.sqrt(self.sum_of_squares / self.samples))
+
+    @property
+    def dynamics(self) -> TransferFunction:
+        """G(s) with G(0) = 1."""
+        return self.scaled.transfer_function(self.shape, self.numerator)
+
+
+class _Cache:
+    """Residual and jacobian of one ψ come from the same transform; compute it once."""
+
+    def __init__(self, problem: Problem, scaled: Scaled) -> None:
+        self._problem, self._scaled = problem, scaled
+        self._shape: FloatArray | None = None
+        self._value: Projection | None = None
+
+    def at(self, shape: FloatArray) -> Projection:
+        if self._value is None or self._shape is None or not np.array_equal(shape, self._shape):
+            self._value = self._problem.project(self._scaled, shape)
+            self._shape = shape.copy()
+        return self._value
+
+
+def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
+    """The best local minimum from ``starts``, each a ψ; all race, the best of them finishes."""
+    scaled = Scaled(structure, problem.rate)
+    cache = _Cache(problem, scaled)
+    best, best_cost = starts[0], np.inf
+    for start in starts:
+        shape = _descend(cache, scaled, start, _RACE_EVALUATIONS) if len(start) else start
+        cost = float(np.sum(cache.at(shape).residual ** 2))
+        if cost < best_cost:
+            best, best_cost = shape, cost
+    if len(best):
+        best = _descend(cache, scaled, best, _FINISH_EVALUATIONS)
+    at = cache.at(best)
+    terms = len(at.linear) - problem.background.shape[1]
+    return Fit(scaled, best, at.linear[:terms], at.linear[terms:], at.residual)
+
+
+def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int) -> FloatArray:
+    """Levenberg and Marquardt's way downhill inside the box, damped after Nielsen (1999).
+
+    On normal equations: a handful of parameters against many samples, whose scale is taken
+    out. A general solver factorises the whole jacobian at each step, and takes ten times as long.
+    """
+    lower, upper = scaled.bounds()
+    shape = np.clip(start, lower, upper)
+    at, damping, growth = cache.at(shape), _FIRST_DAMPING, 2.0
+    cost = float(at.residual @ at.residual)
+    for _ in range(evaluations):
+        slope, curvature = at.jacobian.T @ at.residual, at.jacobian.T @ at.jacobian
+        # A parameter at its bound that would leave the box stays.
+        free = ~(((shape <= lower) & (slope > 0)) | ((shape >= upper) & (slope < 0)))
+        scale = np.sqrt(np.diag(curvature))
+        free &= scale > _INSENSITIVE * np.max(scale)
+        if not np.any(free):
+            break
+        step = _damped_step(curvature, slope, scale, free, damping)
+        trial = np.clip(shape + step, lower, upper)
+        tried = cache.at(trial)
+        new_cost = float(tried.residual @ tried.residual)
+        if not new_cost < cost:
+            if np.all(np.abs(trial - shape) <= _SMALLEST_STEP * (1 + np.abs(shape))):
+                break
+            damping, growth = damping * growth, growth * 2
+            continue
+        gained, promised = cost - new_cost, -float(step @ (2 * slope + curvature @ step))
+        shape, at, cost = trial, tried, new_cost
+        ratio = gained / promised if promised > 0 else 1.0
+        damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
+        # χ² that changes by less than this is converged.
+        if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
+            break
+    return shape
+
+
+def _damped_step(
+    curvature: FloatArray, slope: FloatArray, scale: FloatArray, free: BoolArray, damping: float
+) -> FloatArray:
+    unit = scale[free]
+    matrix = curvature[np.ix_(free, free)] / np.outer(unit, unit)
+    step = np.zeros_like(slope)
+    damped = matrix + damping * np.eye(len(unit))
+    step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
+    # Logarithms of time constants: further than this in one step is a leap in the dark.
+    return np.asarray(np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))

@@ -1,0 +1,223 @@
+"""From a record to a problem that can be fitted, or one clear reason why it cannot.
+
+What happens here is decided before any model exists: which samples count, what the probe
+may have seen besides the motion, and whether it saw the motion at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.output_error import Problem, fit
+from omsm_ros.core.fitting.steps import (
+    LEAST_SAMPLES,
+    Steps,
+    backlash_columns,
+    check_usable,
+    find_steps,
+    sample_noise,
+)
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
+from omsm_ros.units import MICROMETRE_M
+
+# What happened before the record is forgotten after this time.
+_SETTLING_S = 50e-3
+# Interpolation between samples needs neighbours on both sides.
+_EDGE_GUARD = 8
+# In this time a moving end is faded; the shape keeps its content within 4 / time, to 1e-6.
+_FADE_S = 0.5
+_FADE_SHAPE = 12.0
+_SPIKE_SIGMAS = 6.0
+# A probe is linear to a few per cent; beyond this a unit or a target is wrong.
+_PLAUSIBLE_GAIN = (0.5, 2.0)
+# χ² by which a column of the background must improve the fit to be taken: four sigma.
+_CLEARLY_SHOWN = 16.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A problem, the steps in its motion, and the number of single readings taken out.
+
+    backlash_column: of the problem's background, or None where the data show no backlash
+    """
+
+    problem: Problem
+    steps: Steps
+    spikes: int
+    backlash_column: int | None
+
+
+def prepare(record: MotionRecord, source: str) -> Prepared:
+    """Find the motion in ``source`` ("encoder" or "reference") and what the probe saw of it.
+
+    Raises StepTestError without a usable motion, IdentificationError when the probe did not
+    follow it, ConfigurationError for another source.
+    """
+    check_usable(record)
+    motion = _motion(record, source)
+    steps = _seen_whole(find_steps(motion, record.sample_period), record)
+    problem = _problem(record, motion, steps)
+    check_gain(_static_gain(problem))
+    _check_not_clipped(problem)
+    problem, spikes = _without_spikes(problem)
+    problem, backlash = _with_background(problem, steps)
+    return Prepared(problem, steps, spikes, backlash)
+
+
+def _motion(record: MotionRecord, source: str) -> FloatArray:
+    """The motion (n,) that is the input, finite everywhere."""
+    if source == "encoder":
+        return record.z
+    if source != "reference":
+        raise ConfigurationError(f"input {source!r}, expected 'encoder' or 'reference'")
+    known = np.isfinite(record.reference) if record.reference is not None else np.zeros(0, bool)
+    if record.reference is None or not np.any(known):
+        raise IdentificationError(
+            "input 'reference', but the recording has no reading of a reference sensor; "
+            "record /omsm/reference or use input 'encoder'"
+        )
+    index = np.arange(len(known))
+    return np.asarray(np.interp(index, index[known], record.reference[known]))
+
+
+def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
+    samples = len(record)
+    used = record.ok & ~_after_loss(record)
+    used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
+    used[samples - min(_EDGE_GUARD, samples // 10) :] = False
+    carried = _from_rest_to_rest(motion, steps.moving, record.sample_period)
+    used &= carried == motion
+    if np.sum(used) < LEAST_SAMPLES:
+        raise StepTestError(
+            f"of {samples!r} samples {int(np.sum(used))!r} are left to compare, without those "
+            "lost, while something settles, and where the motion starts or ends; record at least "
+            f"{LEAST_SAMPLES} more"
+        )
+    seen = np.where(record.ok, record.distance, 0.0)
+    ramp = np.linspace(-1.0, 1.0, samples)
+    return Problem(
+        motion=carried - np.mean(motion),
+        seen=seen - np.mean(seen[used]),
+        used=used,
+        period=record.sample_period,
+        background=np.column_stack([np.ones(samples), ramp]),
+        rate=2 * np.pi * content_frequency(motion, record.sample_period),
+        noise=steps.noise,
+    )
+
+
+def _from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
+    """``motion`` (n,), where it starts or ends moving faded to its mean there.
+
+    A motion that breaks off would have content at all frequencies, where there was none.
+    """
+    length = min(round(_FADE_S / period), len(motion) // 5)
+    rising = np.cumsum(signal.windows.kaiser(length, _FADE_SHAPE))
+    rising = rising / rising[-1]
+    carried = motion.copy()
+    for moves, end, weight in (
+        (moving[0], slice(0, length), rising),
+        (moving[-1], slice(len(motion) - length, None), rising[::-1]),
+    ):
+        if moves:
+            level = np.mean(motion[end])
+            carried[end] = level + weight * (motion[end] - level)
+    return carried
+
+
+def _after_loss(record: MotionRecord) -> BoolArray:
+    """True where the response still remembers a motion that was lost, shape (n,)."""
+    samples = len(record)
+    if record.z_lost is None:
+        return np.zeros(samples, np.bool_)
+    memory = np.ones(round(_SETTLING_S / record.sample_period) + _EDGE_GUARD + 1)
+    touched = np.convolve(record.z_lost, memory)[_EDGE_GUARD:][:samples]
+    return np.asarray(touched > 0.5)
+
+
+def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
+    """The steps without those edges of which a part was lost."""
+    if record.z_lost is None:
+        return steps
+    lost = record.z_lost
+    whole = tuple(e for e in steps.edges if not np.any(lost[e.start : e.stop]))
+    return replace(steps, edges=whole)
+
+
+def content_frequency(motion: FloatArray, sample_period: float) -> float:
+    """Frequency [Hz] below which 99 % of the velocity's energy lies."""
+    power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
+    share = np.cumsum(power) / np.sum(power)
+    place = int(np.searchsorted(share, 0.99)) + 1
+    return float(place / (len(motion) * sample_period))
+
+
+def _static_gain(problem: Problem) -> float:
+    columns = np.column_stack([problem.motion, problem.background])[problem.used]
+    return float(np.linalg.lstsq(columns, problem.seen[problem.used], rcond=None)[0][0])
+
+
+def check_gain(gain: float) -> None:
+    """Raise IdentificationError unless the probe follows the motion about one to one."""
+    low, high = _PLAUSIBLE_GAIN
+    if not low <= abs(gain) <= high:
+        raise IdentificationError(
+            f"the probe moves by {gain!r} per travel of the axis, expected about 1: check that it "
+            "looks at a fixed target within its range, that both are in metres, and that Z "
+            "moves to and fro, for what goes evenly one way is taken for drift"
+        )
+
+
+def _check_not_clipped(problem: Problem) -> None:
+    motion, seen = problem.motion[problem.used], problem.seen[problem.used]
+    levels = np.unique(seen)
+    quantum = float(np.min(np.diff(levels)))
+    allowed = max(20 * sample_noise(seen), 3 * quantum, 2e-3 * float(np.ptp(motion)))
+    for name, extreme in (("greatest", levels[-1]), ("least", levels[0])):
+        there = motion[seen == extreme]
+        if len(there) >= 5 and np.ptp(there) > allowed:
+            raise IdentificationError(
+                f"the probe gives its {name} distance {len(there)} times while the axis moves by "
+                f"{float(np.ptp(there)) / MICROMETRE_M:.3g} µm: it is clipped; "
+                "centre it in its range"
+            )
+
+
+def _without_spikes(problem: Problem) -> tuple[Problem, int]:
+    """Take out single readings that stand apart from both neighbours, and count them."""
+    apart = np.where(problem.used, problem.seen - _static_gain(problem) * problem.motion, np.nan)
+    before, after = np.roll(apart, 1), np.roll(apart, -1)
+    jump = np.abs(apart - 0.5 * (before + after))
+    # What the edges do nearby is no spike, however large.
+    around = np.fmax(np.abs(before - np.roll(apart, 2)), np.abs(after - np.roll(apart, -2)))
+    around = np.fmax(around, np.abs(after - before))
+    limit = _SPIKE_SIGMAS * sample_noise(apart[np.isfinite(apart)]) + 2 * around
+    spikes = np.isfinite(jump) & np.isfinite(around) & (jump > limit)
+    return replace(problem, used=problem.used & ~spikes), int(np.sum(spikes))
+
+
+def _with_background(problem: Problem, steps: Steps) -> tuple[Problem, int | None]:
+    """Add curvature of the drift, and backlash, where the data clearly show them."""
+    residual = fit(problem, Structure(0, 0, True), [np.array([0.1])]).residual
+    ramp = problem.background[:, 1]
+    background, backlash_column = problem.background, None
+    play = backlash_columns(steps, len(ramp))
+    for columns, is_backlash in ((np.column_stack([ramp**2, ramp**3]), False), (play, True)):
+        known = np.column_stack([background, problem.motion])[problem.used]
+        left = _unexplained(residual, known)
+        after = _unexplained(residual, np.column_stack([known, columns[problem.used]]))
+        improved = (float(left @ left) - float(after @ after)) / np.mean(after**2)
+        if columns.shape[1] and improved > _CLEARLY_SHOWN * columns.shape[1]:
+            backlash_column = background.shape[1] if is_backlash else backlash_column
+            background = np.column_stack([background, columns])
+    return replace(problem, background=background), backlash_column
+
+
+def _unexplained(values: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])

@@ -1,0 +1,120 @@
+"""Where a fit starts: several places, because the output error has local minima.
+
+From the best fit of a smaller structure, so that richer never fits worse; from iterated linear
+least squares and from the subspace method, which find a resonance no guess would; and
+from a plain guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roots
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.samples.blocks import FloatArray
+
+# Guess of the slowest pole, in units of the rate at which the motion has its content.
+_GUESSED_RATE = 3.0
+_GUESSED_ANGLE = 2.0
+# Of the whole lag, the part first given to a delay where there are poles too.
+_KEPT_DELAY = 0.3
+_LINEAR_ITERATIONS = 8
+# An added pole begins fast enough not to be seen, and slow enough to have a gradient.
+_ADDED_POLE = -10.0
+
+
+@dataclass(frozen=True, eq=False)
+class StartingPoints:
+    """Proposes shapes ψ for the structures of one problem.
+
+    pure_delay: the fit of a delay alone;  vote: of the singular values
+    """
+
+    problem: Problem
+    pure_delay: Fit
+    vote: HankelVote
+
+    def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
+        """Shapes of ``structure``, given the fits made so far."""
+        scaled = Scaled(structure, self.problem.rate)
+        delay = float(self.pure_delay.shape[-1]) if self.pure_delay.structure.delay else 0.0
+        if structure.poles == 0:
+            return [self.pure_delay.shape]
+        kept = _KEPT_DELAY * delay if structure.delay else 0.0
+        found = [_guess(scaled, kept), scaled.shape_of(self._linear(structure, kept), kept)]
+        subspace = _stable(self.vote.poles / self.problem.rate)
+        if len(subspace) == structure.poles:
+            found.append(scaled.shape_of(subspace, kept))
+        contained = [f for f in smaller if structure.contains(f.structure)]
+        if contained:
+            found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
+        return found
+
+    @cached_property
+    def _probe(self) -> ComplexArray:
+        """Spectrum of what was seen, without background, lost samples taken from the motion."""
+        problem, lag = self.problem, self.pure_delay
+        seen = problem.seen - problem.background @ lag.background
+        filled = np.where(problem.used, seen, lag.gain * problem.motion)
+        return problem.closed_spectrum(np.asarray(filled))
+
+    def _linear(self, structure: Structure, delay: float) -> ComplexArray:
+        """Poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
+        # At s = 0 only the background is decided; there, and at the end, s may be extreme.
+        inside = slice(1, max(len(self.problem.s) - 1, 2))
+        s, probe = self.problem.s[inside, np.newaxis], self._probe[inside]
+        downs = -(s ** np.arange(1, structure.poles + 1)) * probe[:, np.newaxis]
+        ups = [
+            s ** np.arange(count) * (spectrum[inside, np.newaxis] * np.exp(-delay * s))
+            for spectrum, count in self.problem.drives(structure)
+        ]
+        every = np.concatenate([downs, *ups], axis=1)
+        poles = np.full(structure.poles, -1.0, np.complex128)
+        for _ in range(_LINEAR_ITERATIONS):
+            weight = 1 / np.abs(np.prod(1 - s / poles, axis=1))
+            columns = every * weight[:, np.newaxis]
+            columns = np.concatenate([columns.real, columns.imag])
+            scale = np.linalg.norm(columns, axis=0)
+            scale[scale == 0] = 1.0
+            target = np.concatenate([(probe * weight).real, (probe * weight).imag])
+            solved = np.linalg.lstsq(columns / scale, target, rcond=None)[0] / scale
+            denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
+            found = _stable(ascending_roots(denominator))
+            if len(found) != structure.poles:
+                break
+            poles = found
+        return poles
+
+
+def _guess(scaled: Scaled, delay: float) -> FloatArray:
+    poles: list[complex] = []
+    for index in range(scaled.structure.pairs):
+        upper = complex((index + 1) * _GUESSED_RATE * np.exp(1j * _GUESSED_ANGLE))
+        poles += [upper, upper.conjugate()]
+    if scaled.structure.poles % 2:
+        poles.append(complex(-2.0 * _GUESSED_RATE))
+    return scaled.shape_of(np.array(poles, np.complex128), delay)
+
+
+def _stable(poles: ComplexArray) -> ComplexArray:
+    """Poles in conjugate pairs, reflected to the left half plane and kept off its border."""
+    finite = poles[np.isfinite(poles)]
+    upper = finite[finite.imag > 1e-9 * np.abs(finite)]
+    real = finite[np.abs(finite.imag) <= 1e-9 * np.abs(finite)].real
+    damped = -np.maximum(np.abs(upper.real), 1e-4 * np.abs(upper)) + 1j * upper.imag
+    slow = -np.maximum(np.abs(real), 1e-3).astype(np.complex128)
+    return np.asarray(np.concatenate([damped, np.conj(damped), slow]), np.complex128)
+
+
+def _grown(scaled: Scaled, fit: Fit, delay: float) -> FloatArray:
+    """The smaller fit with fast poles added; their zeros follow linearly."""
+    added = _ADDED_POLE * 1.5 ** np.arange(scaled.structure.poles - fit.structure.poles)
+    own = _stable(fit.dynamics.poles() / scaled.rate)
+    tail = float(fit.shape[-1]) if fit.structure.delay else 0.02 * delay
+    return scaled.shape_of(np.concatenate([own, added.astype(np.complex128)]), tail)

@@ -1,0 +1,172 @@
+"""The steps in a motion: where they are, what lies between them, and which to hold out.
+
+No number, size, direction or rate of steps is assumed. A motion without plateaus (a
+chirp, a scan) has no edges; it identifies as well, by its own content.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import special
+
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import StepTestError
+from omsm_ros.units import MICROMETRE_M
+
+# A fit of even one parameter with its offset, drift and gain needs a multiple of them.
+LEAST_SAMPLES = 50
+# Far beyond the range of any probe that could have seen the motion.
+_GREATEST_TRAVEL_M = 20e-3
+# Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
+_NOISE_FACTOR = 20.0
+_TRAVEL_PART = 2e-3
+_DIFFERENCES = (2, 4, 6, 8)
+# Rest is the axis staying put for this long, and an edge ends when it begins.
+_REST_S = 20e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A move from rest to rest: samples ``start`` to ``stop`` (exclusive), ``height`` [m]."""
+
+    start: int
+    stop: int
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The edges of a motion (n,), its rests, and its noise.
+
+    moving: True from an edge's start to its stop, shape (n,)
+    noise: standard deviation of one encoder sample [m]
+    travel: [m]
+    """
+
+    edges: tuple[Edge, ...]
+    moving: BoolArray
+    noise: float
+    travel: float
+
+
+def sample_noise(values: FloatArray) -> float:
+    """Standard deviation of white noise on a smooth signal, from its differences.
+
+    Motion makes any of them too large, the lowest most; the smallest is the noise. A median,
+    so that the few samples at the edges do not count.
+    """
+    orders = [order for order in _DIFFERENCES if order < len(values)]
+    return min((_difference_noise(values, order) for order in orders), default=0.0)
+
+
+def _difference_noise(values: FloatArray, order: int) -> float:
+    # MAD of a normal distribution is 0.6745 σ; k-th differences have variance C(2k, k) σ².
+    middle = float(np.median(np.abs(np.diff(values, order))))
+    return middle / 0.6745 / float(np.sqrt(special.comb(2 * order, order)))
+
+
+def find_steps(z: FloatArray, sample_period: float) -> Steps:
+    """Edges of ``z`` (n,) [m] sampled every ``sample_period`` [s].
+
+    Raises StepTestError when the axis does not move, or moves farther than any probe sees.
+    """
+    if len(z) < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{len(z)!r} samples are too few to identify anything; "
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
+        )
+    noise, travel = sample_noise(z), float(np.ptp(z))
+    if travel > _GREATEST_TRAVEL_M:
+        raise StepTestError(
+            f"Z travels {travel!r} m, more than any probe can follow on a fixed target; "
+            "positions must be in metres"
+        )
+    if travel <= max(_NOISE_FACTOR * noise, 1e-12):
+        raise StepTestError(
+            f"Z moves by {travel / MICROMETRE_M!r} µm at a noise of {noise / MICROMETRE_M!r} µm: "
+            "no steps; run the step test while recording"
+        )
+    moving = _moving(z, sample_period, max(_NOISE_FACTOR * noise, _TRAVEL_PART * travel))
+    return Steps(_edges(z, moving), moving, noise, travel)
+
+
+def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
+    """True where z leaves its value by more than ``threshold`` within a rest's duration."""
+    width = min(max(round(_REST_S / sample_period), 2), len(z) - 1)
+    changes = np.abs(z[width:] - z[:-width]) > threshold
+    # A change between k and k + width lies anywhere between: close the window over it.
+    covered = np.convolve(changes, np.ones(width + 1))
+    return np.asarray(covered > 0.5)
+
+
+def _edges(z: FloatArray, moving: BoolArray) -> tuple[Edge, ...]:
+    flags = np.diff(np.concatenate([[0], moving.astype(np.int8), [0]]))
+    starts, stops = np.flatnonzero(flags == 1), np.flatnonzero(flags == -1)
+    if len(starts) == 0:
+        return ()
+    bounds = np.concatenate([[0], np.ravel(np.column_stack([starts, stops])), [len(z)]])
+    levels = [
+        float(np.mean(z[a:b])) if b > a else float(z[min(a, len(z) - 1)])
+        for a, b in zip(bounds[::2], bounds[1::2], strict=True)
+    ]
+    return tuple(
+        Edge(int(start), int(stop), levels[i + 1] - levels[i])
+        for i, (start, stop) in enumerate(zip(starts, stops, strict=True))
+        if start > 0 and stop < len(z)
+    )
+
+
+def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]]:
+    """The record cut midway between edges, one edge a piece.
+
+    With fewer than ``least`` edges it is cut into twice as many equal parts instead.
+    """
+    if len(steps.edges) >= least:
+        middles = [(before.stop + after.start) // 2 for before, after in pairwise(steps.edges)]
+        cuts = [0, *middles, samples]
+    else:
+        cuts = [round(samples * i / (2 * least)) for i in range(2 * least + 1)]
+    return list(pairwise(cuts))
+
+
+def held_out(steps: Steps, samples: int) -> BoolArray:
+    """True in every third edge's segment, so that both directions are held out, shape (n,)."""
+    mask = np.zeros(samples, np.bool_)
+    for start, stop in segments(steps, samples)[1::3]:
+        mask[start:stop] = True
+    return mask
+
+
+def backlash_columns(steps: Steps, samples: int) -> FloatArray:
+    """Direction of the last move (n, 1 or 2), and a mark of the time before the first.
+
+    A play of b shifts what the probe sees by ±b/2 with the direction of approach.
+    """
+    if not steps.edges:
+        return np.empty((samples, 0))
+    direction = np.zeros(samples)
+    for edge in steps.edges:
+        direction[edge.start :] = np.sign(edge.height)
+    if np.all(direction[steps.edges[0].start :] == direction[-1]):
+        return np.empty((samples, 0))
+    before = (np.arange(samples) < steps.edges[0].start).astype(np.float64)
+    return np.column_stack([direction, before])
+
+
+def check_usable(record: MotionRecord) -> None:
+    """Raise StepTestError when too few samples of the record can be used, saying why."""
+    if len(record) < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{len(record)!r} samples are too few to identify anything; "
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
+        )
+    usable = int(np.sum(record.ok))
+    if usable < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{usable!r} of {len(record)} samples are usable (counts {dict(record.counts)!r}); "
+            "check the probe's target and range, and the encoder"
+        )

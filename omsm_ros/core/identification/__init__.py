@@ -1,0 +1,1 @@
+"""From a recording to a calibration: band, tests of the residual, verdict."""

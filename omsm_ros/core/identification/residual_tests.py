@@ -1,0 +1,127 @@
+"""Does a fitted model leave anything unexplained? Tests on its residual, and a second method.
+
+The tests of Ljung (1999, ch. 16): a white residual says that the noise is understood, a
+residual independent of the motion says that the dynamics are. The second matters more;
+the covariance allows for coloured noise, but for a missing mode nothing can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, stats
+
+from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
+from omsm_ros.core.fitting.covariance import autoregression
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+
+_LAGS = 25
+# After an edge the response is looked at for this long.
+_AFTER_EDGE_S = 50e-3
+_LEAST_REST_SAMPLES = 200
+# No probe tells less; a misfit below it is none.
+_FINEST_READING_M = 1e-10
+
+
+@dataclass(frozen=True)
+class ResidualTests:
+    """chi_square: mean square where the axis moves over that of noise;  noise: [m]
+    whiteness, independence: p-values, small where the residual is coloured or follows the motion
+    """
+
+    chi_square: float
+    noise: float
+    whiteness: float
+    independence: float
+
+
+def residual_tests(
+    problem: Problem, fitted: Fit, steps: Steps, noise: float | None
+) -> ResidualTests:
+    """Tests of the residual of ``fitted``; ``noise`` [m] if known, else taken at rest."""
+    on_grid = np.zeros(len(problem.used))
+    on_grid[problem.used] = fitted.residual
+    active = problem.used & _active(steps, problem.period)
+    rest = problem.used & ~active
+    if noise is None:
+        noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
+    seen_moving = on_grid[active] if np.any(active) else fitted.residual
+    lost = fitted.structure.size
+    chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2
+    return ResidualTests(
+        chi_square,
+        noise,
+        whiteness(fitted.residual),
+        independence(fitted.residual, np.gradient(problem.motion)[problem.used]),
+    )
+
+
+def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
+    """Power of the noise at low frequency over its mean where the axis rests; 1 for white."""
+    on_grid = problem.seen - problem.output(fitted)
+    rest = on_grid[problem.used & ~_active(steps, problem.period)]
+    if len(rest) < _LEAST_REST_SAMPLES:
+        return 1.0
+    rest = rest - np.mean(rest)
+    coefficients, variance = autoregression(rest)
+    power = float(np.mean(rest**2)) * float(np.sum(coefficients)) ** 2
+    return max(variance / power, 1.0) if power > 0 else 1.0
+
+
+def _active(steps: Steps, period: float) -> BoolArray:
+    after = round(_AFTER_EDGE_S / period)
+    return np.asarray(np.convolve(steps.moving, np.ones(after + 1))[: len(steps.moving)] > 0.5)
+
+
+def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
+    if np.sum(rest) >= _LEAST_REST_SAMPLES:
+        return float(np.std(on_grid[rest]))
+    # No rest: white noise is what neighbouring samples do not share.
+    return float(np.sqrt(np.mean(np.diff(on_grid[used], 2) ** 2) / 6.0))
+
+
+def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
+    """p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
+    n = len(residual)
+    correlation = _correlation(residual, residual, lags)[1:]
+    statistic = n * (n + 2) * np.sum(correlation**2 / (n - np.arange(1, lags + 1)))
+    return float(stats.chi2.sf(statistic, lags))
+
+
+def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> float:
+    """p-value that ``residual`` (k,) does not follow ``drive`` (k,), the motion's rate.
+
+    The residual is regressed on the last ``lags`` values of the drive, which are correlated;
+    so few of its directions count, and only those above rounding are counted.
+    """
+    past = np.column_stack([np.roll(drive, lag) for lag in range(lags)])[lags:]
+    left, values, _ = np.linalg.svd(past, full_matrices=False)
+    basis = left[:, values > 1e-6 * values[0]] if values[0] > 0 else left[:, :0]
+    rest = residual[lags:]
+    statistic = float(np.sum((basis.T @ rest) ** 2)) / float(np.mean(rest**2) or 1.0)
+    return float(stats.chi2.sf(statistic, basis.shape[1])) if basis.shape[1] else 1.0
+
+
+def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
+    size = fft.next_fast_len(len(a) + lags + 1, real=True)
+    cross = fft.irfft(fft.rfft(a, size) * np.conj(fft.rfft(b, size)), size)[: lags + 1]
+    norm = float(np.linalg.norm(a) * np.linalg.norm(b)) or 1.0
+    return np.asarray(cross / norm)
+
+
+def response_agreement(left: FrequencyResponse, up_to: float) -> float:
+    """Mean square difference of two responses over its uncertainty, 0 to ``up_to`` [Hz]; about 1.
+
+    left: response, without a model, of what a model leaves of what was seen. That is the
+        response of what was seen less that of what was modelled, both through the same
+        windows: what these leak of a light mode is in both, and cancels.
+    NaN where there is no line.
+    """
+    lines = (left.frequency > 0) & (left.frequency <= up_to)
+    if not np.any(lines):
+        return float("nan")
+    # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
+    return float(np.mean(0.5 / left.uncertainty[lines] ** 2))

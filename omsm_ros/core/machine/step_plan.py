@@ -1,0 +1,122 @@
+"""A step test that a machine can run and that hides nothing between samples.
+
+Edges are jerk-limited S-curves, and each starts at another fraction of the sample period,
+so that what still folds does not fold alike every time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.machine.trajectories import AxisPositions, s_curve
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M
+
+# The golden ratio's fraction spreads any number of edges evenly over the sample period.
+_GOLDEN = 0.6180339887498949
+# An S-curve of this many samples has nothing worth naming beyond half the rate.
+_LEAST_RISE_SAMPLES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class StepPlan:
+    """Start of each edge [s], height of each [m], its rise [s], and the whole duration [s].
+
+    It is a motion of the cell like any in :mod:`omsm_ros.core.machine.trajectories`.
+    """
+
+    starts: tuple[float, ...]
+    heights: tuple[float, ...]
+    rise: float
+    duration: float
+
+    def z(self, time: FloatArray) -> FloatArray:
+        """Commanded position [m] at ``time`` [s], of the same shape."""
+        position = np.zeros_like(time)
+        for start, height in zip(self.starts, self.heights, strict=True):
+            position = position + height * s_curve((time - start) / self.rise)
+        return position
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Commanded axes at ``time`` [s]; only Z moves."""
+        zero = np.zeros_like(time)
+        return AxisPositions(zero, zero, self.z(time), zero, zero)
+
+
+def plan_steps(
+    *,
+    sample_period: float,
+    step: float = 9.8e-6,
+    count: int = 10,
+    dwell: float = 0.5,
+    rise: float = 20e-3,
+    half_range: float = 50e-6,
+) -> StepPlan:
+    """``count`` steps up and as many down, dithered within ``sample_period`` [s].
+
+    step: [m];  dwell: from edge to edge [s];  rise: of an edge [s]
+    half_range: of the probe [m], which must hold the whole travel
+
+    Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
+    """
+    if count < 1 or not step > 0 or not sample_period > 0:
+        raise ConfigurationError(
+            f"step plan: count {count!r}, step {step!r} m and sample_period {sample_period!r} s "
+            "must be positive"
+        )
+    if rise < _LEAST_RISE_SAMPLES * sample_period:
+        raise ConfigurationError(
+            f"step plan: rise {rise!r} s is too sharp for samples every {sample_period!r} s; "
+            f"use at least {_LEAST_RISE_SAMPLES * sample_period!r} s"
+        )
+    if count * step > 2 * half_range:
+        raise ConfigurationError(
+            f"step plan: {count!r} steps of {step!r} m leave the probe's range of "
+            f"±{half_range!r} m; use fewer or smaller steps"
+        )
+    if dwell < 3 * rise:
+        raise ConfigurationError(
+            f"step plan: dwell {dwell!r} s leaves no rest after a rise of {rise!r} s"
+        )
+    edges = np.arange(1, 2 * count + 1)
+    dither = (edges * _GOLDEN) % 1.0 * sample_period
+    heights = np.where(edges <= count, step, -step)
+    return StepPlan(
+        tuple((edges * dwell + dither).tolist()),
+        tuple(heights.tolist()),
+        rise,
+        float(dwell * (2 * count + 1)),
+    )
+
+
+def plan_csv(plan: StepPlan, period: float) -> str:
+    """``time_s,z_m`` lines every ``period`` [s], a header first."""
+    time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
+    rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]
+    return "\n".join(["time_s,z_m", *rows]) + "\n"
+
+
+def plan_gcode(plan: StepPlan) -> str:
+    """The plan as G-code in millimetres: each edge a G1 at its mean feed, then a G4 dwell.
+
+    Jerk is limited by the controller: set its S-curve so that an edge takes ``plan.rise``.
+    """
+    lines = [
+        "; step test for the identification of the measuring loop",
+        f"; {len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
+        "G21 ; millimetres",
+        "G91 ; relative",
+    ]
+    now = 0.0
+    for start, height in zip(plan.starts, plan.heights, strict=True):
+        feed = abs(height) / plan.rise / MILLIMETRE_M * 60
+        lines.append(f"G4 P{start - now:.6f} ; rest, seconds")
+        lines.append(
+            f"G1 Z{height / MILLIMETRE_M:+.6f} F{feed:.4f} ; {height / MICROMETRE_M:+.3f} um"
+        )
+        now = start + plan.rise
+    lines += [f"G4 P{plan.duration - now:.6f}", "G90", "M2"]
+    return "\n".join(lines) + "\n"

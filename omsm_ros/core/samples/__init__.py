@@ -1,0 +1,1 @@
+"""What devices deliver: blocks, counters, recordings, and where every sample went."""

@@ -1,0 +1,175 @@
+"""Frozen records that modules hand to each other; they mirror the wire contract.
+
+A *block* is a run of consecutive samples of one trigger counter. All quantities
+are SI; arrays are float64 of shape (n,) unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import DataError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+# No device here delivers more in one message; a longer block is a forgery or a wrong unit.
+MAX_BLOCK_SAMPLES = 4_000_000
+
+
+class Status(IntEnum):
+    """Verdict of the probe on one sample (values of ``DistanceBlock.status``)."""
+
+    OK = 0
+    NO_TARGET = 1
+    SATURATED = 2
+    OUT_OF_RANGE = 3
+    LOST = 4
+
+
+def _empty_f32() -> NDArray[np.float32]:
+    return np.empty(0, np.float32)
+
+
+def _empty_u8() -> NDArray[np.uint8]:
+    return np.empty(0, np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Block:
+    """What every block has: when and where in the trigger count it lies.
+
+    stamp_ns: time of the first sample [ns, ROS time]
+    first_sample: trigger counter of the first sample
+    sample_period: [s]
+    """
+
+    stamp_ns: int
+    first_sample: int
+    sample_period: float
+
+    def __len__(self) -> int:
+        """Samples in the block."""
+        raise NotImplementedError
+
+    def _check(self, name: str, lengths: set[int]) -> None:
+        if len(lengths) != 1:
+            raise DataError(f"{name}: channels of different lengths {sorted(lengths)!r}")
+        (length,) = lengths
+        if not 0 < length <= MAX_BLOCK_SAMPLES:
+            raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")
+        if not (np.isfinite(self.sample_period) and self.sample_period > 0):
+            raise DataError(
+                f"{name}: sample_period {self.sample_period!r} s, expected a positive number"
+            )
+        if self.first_sample < 0:
+            raise DataError(f"{name}: first_sample {self.first_sample!r} is negative")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisBlock(Block):
+    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+    def __post_init__(self) -> None:
+        self._check("AxisBlock", {len(a) for a in (self.x, self.y, self.z, self.b, self.c)})
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DistanceBlock(Block):
+    """Probe readings: distance [m] (n,), intensity 0-1 (n,) or (0,), status (n,) or (0,).
+
+    An empty status means that every sample is OK, an empty intensity that the
+    device does not tell.
+    """
+
+    distance: FloatArray
+    intensity: NDArray[np.float32] = field(default_factory=_empty_f32)
+    status: NDArray[np.uint8] = field(default_factory=_empty_u8)
+
+    def __post_init__(self) -> None:
+        optional = {len(a) for a in (self.intensity, self.status) if len(a)}
+        self._check("DistanceBlock", {len(self.distance)} | optional)
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    @property
+    def ok(self) -> BoolArray:
+        """True where the probe gave a usable, finite reading, shape (n,)."""
+        finite = np.isfinite(self.distance)
+        return finite & (self.status == Status.OK) if len(self.status) else finite
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AccelerationBlock(Block):
+    """Acceleration x, y, z [m/s²], each of shape (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+
+    def __post_init__(self) -> None:
+        self._check("AccelerationBlock", {len(a) for a in (self.x, self.y, self.z)})
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+def join_axes(blocks: Sequence[AxisBlock]) -> AxisBlock:
+    """One block of blocks that follow each other (see :func:`follows`)."""
+    first = blocks[0]
+    x, y, z, b, c = (np.concatenate([getattr(k, name) for k in blocks]) for name in "xyzbc")
+    return AxisBlock(
+        stamp_ns=first.stamp_ns,
+        first_sample=first.first_sample,
+        sample_period=first.sample_period,
+        x=x,
+        y=y,
+        z=z,
+        b=b,
+        c=c,
+    )
+
+
+def join_distance(blocks: Sequence[DistanceBlock]) -> DistanceBlock:
+    """One block of blocks that follow each other (see :func:`follows`)."""
+    first = blocks[0]
+    return DistanceBlock(
+        stamp_ns=first.stamp_ns,
+        first_sample=first.first_sample,
+        sample_period=first.sample_period,
+        distance=np.concatenate([k.distance for k in blocks]),
+        intensity=np.concatenate([k.intensity for k in blocks]),
+        status=np.concatenate([k.status for k in blocks]),
+    )
+
+
+def follows(block: Block, before: Block) -> bool:
+    """True if ``block`` goes on where ``before`` ends, with the same channels."""
+    return (
+        block.first_sample == before.first_sample + len(before)
+        and block.sample_period == before.sample_period
+        and _optional_channels(block) == _optional_channels(before)
+    )
+
+
+def _optional_channels(block: Block) -> tuple[bool, bool]:
+    if not isinstance(block, DistanceBlock):
+        return (False, False)
+    return (bool(len(block.intensity)), bool(len(block.status)))

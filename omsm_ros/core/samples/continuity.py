@@ -1,0 +1,107 @@
+"""Does a block continue its stream, or what happened in between?
+
+A device counts its triggers. The count tells gaps, repetitions and late arrivals; together
+with the time stamp it tells a device that has begun to count anew. Stamps may advance more
+slowly than the count times the sample period, when a recording is played in time lapse.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from omsm_ros.core.samples.blocks import Block
+from omsm_ros.errors import DataError
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Devices count triggers in 32 bits.
+COUNTER_SPAN = 2**32
+# Beyond 2**63 a count would not fit into an index; no device gets near.
+_MAX_COUNT = 2**62
+# Messages are not delivered this late; time that falls back further has been set back.
+TIME_JUMP_S = 2.0
+# A count that wrapped goes on close to zero; a larger leap is a device that was reset.
+_MAX_WRAP_GAP = 1_000_000
+_GAPS_REMEMBERED = 256
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What a block brings.
+
+    session: rises when the count begins anew;  first: unwrapped count of the block's first sample
+    skip: leading samples to leave out, of which ``late`` fill a gap and the others were seen before
+    """
+
+    session: int
+    first: int
+    skip: int
+    late: int
+
+
+class TriggerCount:
+    """Follows the trigger count of one stream."""
+
+    def __init__(self) -> None:
+        self._session = -1
+        self._offset = 0
+        self._next = 0
+        self._newest_first = 0
+        self._newest_stamp_ns: int | None = None
+        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS_REMEMBERED)
+
+    def place(self, block: Block, length: int) -> Arrival:
+        """Place ``block`` of ``length`` samples after what came before.
+
+        Raises DataError for a count that no device reaches.
+        """
+        if block.first_sample > _MAX_COUNT:
+            raise DataError(
+                f"first_sample {block.first_sample!r} is not a trigger count, which is below 2**62"
+            )
+        first = self._unwrapped(block.first_sample)
+        if self._begins_anew(first, block):
+            self._session += 1
+            self._offset = 0
+            first = block.first_sample
+            self._next = first
+            self._gaps.clear()
+        elif first > self._next:
+            self._gaps.append((self._next, first))
+        end = first + length
+        skip = min(max(self._next - first, 0), length)
+        late = sum(max(min(b, first + skip) - max(a, first), 0) for a, b in self._gaps)
+        if skip < length:
+            self._next = end
+            self._newest_first, self._newest_stamp_ns = first, block.stamp_ns
+        return Arrival(self._session, first, skip, min(late, skip))
+
+    def end(self) -> None:
+        """Whatever comes next begins a session."""
+        self._newest_stamp_ns = None
+
+    def _unwrapped(self, count: int) -> int:
+        count += self._offset
+        beyond = count + COUNTER_SPAN
+        if 0 <= beyond - self._next <= _MAX_WRAP_GAP and self._newest_stamp_ns is not None:
+            self._offset += COUNTER_SPAN
+            return beyond
+        if self._offset and count - self._next > COUNTER_SPAN // 2:
+            # A late block from before the wrap.
+            return count - COUNTER_SPAN
+        return count
+
+    def _begins_anew(self, first: int, block: Block) -> bool:
+        if self._newest_stamp_ns is None:
+            return True
+        elapsed_ns = block.stamp_ns - self._newest_stamp_ns
+        tolerance_ns = TIME_JUMP_S * NANOSECONDS_PER_S
+        if elapsed_ns < -tolerance_ns:
+            return True
+        if first >= self._next:
+            return False
+        if first <= self._newest_first:
+            return elapsed_ns > 0
+        # An overlapping block is due between the newest block and the next one.
+        due_ns = (first - self._newest_first) * block.sample_period * NANOSECONDS_PER_S
+        return elapsed_ns > due_ns + tolerance_ns

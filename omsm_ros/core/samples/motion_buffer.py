@@ -1,0 +1,51 @@
+"""The last motion of the cell, kept while it happens, for an identification on request."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Generic, TypeVar
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+
+B = TypeVar("B", AxisBlock, DistanceBlock)
+
+
+class BlockBuffer(Generic[B]):
+    """Blocks of one topic since its trigger counter last started anew, bounded in samples.
+
+    The oldest blocks go when ``capacity`` samples are exceeded; ``forgotten`` counts theirs.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._blocks: deque[B] = deque()
+        self._samples = 0
+        self.forgotten = 0
+
+    def add(self, block: B) -> None:
+        """Append a block; a counter that falls back behind the last block begins a new motion."""
+        if self._blocks and block.first_sample < self._blocks[-1].first_sample:
+            self._forget(len(self._blocks))
+        self._blocks.append(block)
+        self._samples += len(block)
+        while self._samples > self._capacity and len(self._blocks) > 1:
+            self._forget(1)
+
+    def _forget(self, blocks: int) -> None:
+        for _ in range(blocks):
+            samples = len(self._blocks.popleft())
+            self._samples -= samples
+            self.forgotten += samples
+
+    def __len__(self) -> int:
+        """Samples held."""
+        return self._samples
+
+    def recent(self, duration: float = 0.0) -> list[B]:
+        """Blocks that reach into the last ``duration`` seconds of the motion; 0 = all."""
+        if not self._blocks or duration == 0:
+            return list(self._blocks)
+        last = self._blocks[-1]
+        end = last.first_sample + len(last)
+        first = end - duration / last.sample_period
+        return [b for b in self._blocks if b.first_sample + len(b) > first]

@@ -1,0 +1,191 @@
+"""Which samples of two streams belong to one trigger?
+
+Both streams are queues in the order of their sessions and trigger counts. Their heads are
+compared: equal counts of the same session make pairs, and a head that the other stream has
+already passed will never find its partner. Every decision rests on the two heads alone,
+so the outcome does not depend on how the streams were interleaved or cut.
+
+Sessions are counted by each stream for itself. The first pair with the same count *and* the
+same time links a session of one stream to a session of the other.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.samples.accounts import Reason, Tally
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.continuity import COUNTER_SPAN
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
+STAMP_TOLERANCE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Consecutive samples of one stream.
+
+    session, first: of the first sample;  stamp_ns, period_ns: its time and the step [ns]
+    reasons: why a sample cannot become a point, Reason, (n,)
+    values: the stream's channels, (channels, n)
+    """
+
+    session: int
+    first: int
+    stamp_ns: int
+    period_ns: float
+    reasons: NDArray[np.uint8]
+    values: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.reasons)
+
+    @property
+    def end(self) -> int:
+        """The count after the last sample."""
+        return self.first + len(self)
+
+    def stamp_of(self, count: int) -> float:
+        """Time of the sample ``count`` [ns]."""
+        return self.stamp_ns + (count - self.first) * self.period_ns
+
+    def part(self, start: int, stop: int) -> Run:
+        """The samples from index ``start`` up to ``stop``."""
+        return Run(
+            self.session,
+            self.first + start,
+            self.stamp_ns + round(start * self.period_ns),
+            self.period_ns,
+            self.reasons[start:stop],
+            self.values[:, start:stop],
+        )
+
+
+class Queue:
+    """Runs of one stream that wait for a partner."""
+
+    def __init__(self, tally: Tally) -> None:
+        self.pending = 0
+        self._runs: deque[Run] = deque()
+        self._tally = tally
+
+    @property
+    def head(self) -> Run | None:
+        """The oldest run."""
+        return self._runs[0] if self._runs else None
+
+    def push(self, run: Run) -> None:
+        """Append the newest run."""
+        self._runs.append(run)
+        self.pending += len(run)
+
+    def drop(self, samples: int) -> None:
+        """The oldest ``samples`` of the head have no partner."""
+        reasons = self._cut(samples).reasons
+        self._tally.count_each(np.where(reasons, reasons, np.uint8(Reason.UNMATCHED)))
+
+    def pair(self, samples: int, partner_reasons: NDArray[np.uint8]) -> Run:
+        """Take the oldest ``samples`` of the head, whose partners have these reasons."""
+        run = self._cut(samples)
+        if run.reasons.any() or partner_reasons.any():
+            self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
+        else:
+            self._tally.count(Reason.NONE, samples)
+        return run
+
+    def limit(self, samples: int) -> None:
+        """Drop the oldest until no more than ``samples`` wait."""
+        while self.pending > samples:
+            self.drop(min(self.pending - samples, len(self._runs[0])))
+
+    def clear(self) -> None:
+        """Nothing that waits will find a partner."""
+        while self._runs:
+            self.drop(len(self._runs[0]))
+
+    def _cut(self, samples: int) -> Run:
+        run = self._runs[0]
+        self.pending -= samples
+        if samples == len(run):
+            return self._runs.popleft()
+        self._runs[0] = run.part(samples, len(run))
+        return run.part(0, samples)
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """Session of the axes, session of the distance, and what to add to the distance's count."""
+
+    axes: int
+    distance: int
+    shift: int
+
+
+class Pairing:
+    """Joins the two queues."""
+
+    def __init__(self, axes: Tally, distance: Tally) -> None:
+        self.axes = Queue(axes)
+        self.distance = Queue(distance)
+        self._link = _Link(-1, -1, 0)
+
+    def pairs(self) -> Iterator[tuple[Run, Run]]:
+        """Runs of axes and distance of equal count and length, as far as they are complete."""
+        while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
+            order = self._order(a, d)
+            if order < 0:
+                self.axes.drop(self._leading(a, d.first + self._link.shift, a.session, d))
+            elif order > 0:
+                self.distance.drop(self._leading(d, a.first - self._link.shift, a.session, d))
+            else:
+                samples = min(len(a), len(d))
+                yield (
+                    self.axes.pair(samples, d.reasons[:samples]),
+                    self.distance.pair(samples, a.reasons[:samples]),
+                )
+
+    def _leading(self, run: Run, other_first: int, axes_session: int, d: Run) -> int:
+        """Samples of ``run`` before the other head, all of them if the sessions differ."""
+        if (axes_session, d.session) != (self._link.axes, self._link.distance):
+            return len(run)
+        return min(other_first - run.first, len(run))
+
+    def _order(self, a: Run, d: Run) -> int:
+        """-1: the axes' head has no partner; 1: the distance's; 0: both begin with a pair."""
+        if (a.session, d.session) != (self._link.axes, self._link.distance):
+            shift = round((a.first - d.first) / COUNTER_SPAN) * COUNTER_SPAN
+            if _apart(a, d, shift):
+                return self._older(a, d)
+            if _overlap(a, d, shift):
+                self._link = _Link(a.session, d.session, shift)
+            return _sign(a.first - (d.first + shift))
+        return _sign(a.first - (d.first + self._link.shift))
+
+    def _older(self, a: Run, d: Run) -> int:
+        """Which of two heads that cannot be of one session is left over from before."""
+        if a.session == self._link.axes:
+            return -1
+        if d.session == self._link.distance:
+            return 1
+        return _sign(a.stamp_ns - d.stamp_ns) or -1
+
+
+def _apart(a: Run, d: Run, shift: int) -> bool:
+    """True if one trigger count would have had two different times."""
+    count = max(a.first, d.first + shift)
+    lead_ns = a.stamp_of(count) - d.stamp_of(count - shift)
+    return abs(lead_ns) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
+
+
+def _overlap(a: Run, d: Run, shift: int) -> bool:
+    return max(a.first, d.first + shift) < min(a.end, d.end + shift)
+
+
+def _sign(value: float) -> int:
+    return (value > 0) - (value < 0)

@@ -1,0 +1,1 @@
+"""From points to a result: nominal shapes and the deviation from them."""

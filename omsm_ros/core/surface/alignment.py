@@ -1,0 +1,216 @@
+"""Where does the probe pass the spindle axis, and how does its beam lean?
+
+From a scan of a reference sphere. A probe that passes the axis at a distance measures a
+sphere as something else: off by e along the feed it sees a cusp or a dimple at the centre,
+off across the feed a flattened one. A beam that leans by β over the distance d looks d β
+aside. Both are found by fitting the sphere to the points that the corrector would deliver
+with the corrected geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize
+
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
+from omsm_ros.errors import DataError
+from omsm_ros.units import MICROMETRE_M
+
+_MIN_POINTS = 1000
+_MAX_POINTS = 60_000
+_GROUP_POINTS = 100
+# Unknowns are fitted in these units: micrometres for lengths, milliradians for slopes.
+_SLOPE_UNIT = 1e-3
+# With less than this a slope of the beam moves no point by a nanometre.
+_USEFUL_DISTANCE_M = 2e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SphereScan:
+    """A scan of a sphere before kinematics, each array (n,).
+
+    x, y: slides [m];  z: H(z) [m];  b, c: [rad];  distance: true, growing with height [m]
+    """
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+    distance: FloatArray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Geometry found, and how well.
+
+    uncertainty: standard uncertainties of centre_x, centre_y [m], beam_x, beam_y [1]
+    sphere: centre in the workpiece frame and radius [m]; convex if its centre lies below
+    residual: rms left [m];  beam_found: False where the distance hardly varied
+    """
+
+    geometry: Geometry
+    uncertainty: tuple[float, float, float, float]
+    sphere: tuple[float, float, float, float]
+    residual: float
+    beam_found: bool
+
+
+def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
+    """The scan behind points that were corrected with no geometry and no sideways lag.
+
+    axes: the blocks of that one scan. Raises DataError for a point that is in none of them.
+    """
+    counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in axes])
+    order = np.argsort(counts, kind="stable")
+    index = np.minimum(np.searchsorted(counts, points.sample, sorter=order), len(counts) - 1)
+    place = order[index]
+    strange = np.flatnonzero(counts[place] != points.sample)
+    if len(strange):
+        raise DataError(
+            f"sample {int(points.sample[strange[0]])!r} is in none of the axis blocks; "
+            "give the blocks of the scan that was corrected"
+        )
+    x, y, z, b, c = (
+        np.concatenate([getattr(block, name) for block in axes])[place] for name in "xyzbc"
+    )
+    moved = z - points.dynamic_error
+    return SphereScan(x=x, y=y, z=moved, b=b, c=c, distance=(points.height - moved) / np.cos(b))
+
+
+def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None = None) -> Alignment:
+    """Fit spindle centre and lean of the beam to a scan of a sphere.
+
+    radius: of the sphere [m], certified; negative for a convex one
+    geometry: what is known already: the probe's place; its centre and beam are the start
+
+    Raises DataError for a scan that is too short, or does not look like the sphere.
+    """
+    scan = _thinned(scan)
+    start = geometry or Geometry()
+    beam = bool(np.ptp(scan.distance) > _USEFUL_DISTANCE_M)
+    first = _first_guess(scan, radius, start, beam)
+    found = optimize.least_squares(
+        lambda unknown: _misfit(scan, radius, start, unknown),
+        first,
+        jac=lambda unknown: _jacobian(scan, start, unknown),
+        method="lm",
+        x_scale="jac",
+    )
+    residual = float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
+    if not found.success or residual > 0.01 * abs(radius):
+        raise DataError(
+            f"the scan does not fit a sphere of radius {radius!r} m: {residual!r} m are left"
+        )
+    deviations = _standard_uncertainties(found.jac, found.fun)
+    aligned = _with(start, found.x)
+    in_si = np.append(deviations[:2] * MICROMETRE_M, (deviations[5:] * _SLOPE_UNIT))
+    lean = in_si[2:] if beam else (np.inf, np.inf)
+    sphere = tuple(float(v) * MICROMETRE_M for v in found.x[2:5])
+    return Alignment(
+        geometry=aligned,
+        uncertainty=(float(in_si[0]), float(in_si[1]), float(lean[0]), float(lean[1])),
+        sphere=(sphere[0], sphere[1], sphere[2], radius),
+        residual=residual,
+        beam_found=beam,
+    )
+
+
+def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:
+    centred = replace(
+        geometry,
+        centre_x=float(unknown[0]) * MICROMETRE_M,
+        centre_y=float(unknown[1]) * MICROMETRE_M,
+    )
+    if len(unknown) == 5:
+        return centred
+    return replace(
+        centred,
+        beam_x=float(unknown[5]) * _SLOPE_UNIT,
+        beam_y=float(unknown[6]) * _SLOPE_UNIT,
+    )
+
+
+def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatArray) -> FloatArray:
+    """Distances of the points from the sphere [µm], (n,)."""
+    points = workpiece_points(
+        _with(geometry, unknown), (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance
+    )
+    centre = unknown[2:5] * MICROMETRE_M
+    away = np.sqrt(
+        (points.x - centre[0]) ** 2 + (points.y - centre[1]) ** 2 + (points.height - centre[2]) ** 2
+    )
+    return np.asarray((away - abs(radius)) / MICROMETRE_M, np.float64)
+
+
+def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
+    """Derivatives of :func:`_misfit` (n, 5 or 7).
+
+    Analytic in the centres: on a sphere that runs true, an offset across the feed shows in
+    second order only, and the rounding of differences would pass for knowledge of it.
+    """
+    slides = (scan.x, scan.y, scan.z)
+    points = workpiece_points(_with(geometry, unknown), slides, scan.b, scan.c, scan.distance)
+    away = np.stack(points) - unknown[2:5, np.newaxis] * MICROMETRE_M
+    x, y, z = away / np.sqrt(np.sum(away**2, axis=0))
+    cosine, sine = np.cos(scan.c), np.sin(scan.c)
+    columns = [y * sine - x * cosine, -x * sine - y * cosine, -x, -y, -z]
+    for k in range(5, len(unknown)):
+        # The reach of the beam is all but linear in its lean: a difference over a milliradian.
+        step = np.zeros_like(unknown)
+        step[k] = 0.5
+        ends = [
+            np.stack(
+                workpiece_points(
+                    _with(geometry, unknown + sign * step), slides, scan.b, scan.c, scan.distance
+                )
+            )
+            for sign in (1, -1)
+        ]
+        columns.append(np.sum((ends[0] - ends[1]) * [x, y, z], axis=0) / MICROMETRE_M)
+    return np.stack(columns, axis=1)
+
+
+def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool) -> FloatArray:
+    """The sphere's centre one radius off the lowest or highest of a fitted paraboloid."""
+    points = workpiece_points(geometry, (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance)
+    ones = np.ones(len(points.x))
+    terms = np.stack([ones, points.x, points.y, points.x**2 + points.y**2], axis=1)
+    level, slope_x, slope_y, _ = np.linalg.lstsq(terms, points.height, rcond=None)[0]
+    centre = np.array([-slope_x * radius, -slope_y * radius, level + radius]) / MICROMETRE_M
+    known = np.array([geometry.centre_x, geometry.centre_y]) / MICROMETRE_M
+    lean = np.array([geometry.beam_x, geometry.beam_y]) / _SLOPE_UNIT
+    return np.concatenate([known, centre, lean if beam else lean[:0]])
+
+
+def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """From residuals that may be correlated within groups of consecutive points."""
+    # Through the singular values of scaled columns: the normal equations would square the
+    # condition number, and with it lose what is barely known.
+    scale = np.linalg.norm(jacobian, axis=0)
+    _, values, rows = np.linalg.svd(jacobian / scale, full_matrices=False)
+    root = rows.T / values / scale[:, np.newaxis]
+    inverse = root @ root.T
+    edges = np.arange(0, len(residual), _GROUP_POINTS)
+    scores = np.add.reduceat(jacobian * residual[:, np.newaxis], edges, axis=0)
+    correction = len(scores) / (len(scores) - 1)
+    covariance = inverse @ (correction * scores.T @ scores) @ inverse
+    return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
+
+
+def _thinned(scan: SphereScan) -> SphereScan:
+    samples = len(scan.z)
+    names: Sequence[str] = ("x", "y", "z", "b", "c", "distance")
+    good = np.all([np.isfinite(getattr(scan, name)) for name in names], axis=0)
+    if np.count_nonzero(good) < _MIN_POINTS:
+        raise DataError(
+            f"scan of {int(np.count_nonzero(good))} finite points of {samples}, "
+            f"expected {_MIN_POINTS} or more"
+        )
+    used = np.flatnonzero(good)[:: -(-samples // _MAX_POINTS)]
+    return SphereScan(**{name: getattr(scan, name)[used] for name in names})

@@ -1,0 +1,269 @@
+"""How far is a measured surface from the nominal one?
+
+All functions take a cloud in any order; none needs a grid. Nothing is filtered or
+thinned: every point that is passed in counts in the statistics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.errors import DataError
+
+_SECTORS = 12
+# Beyond this a spacing is a mistaken unit, and its rings would not fit into memory.
+_MOST_STRETCHES = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class FormStatistics:
+    """Figures of a deviation.
+
+    peak_to_valley: largest minus smallest [m]
+    rms: root mean square about zero, every point alike [m]
+    rms_area_weighted: the same, every piece of area alike [m]
+    points: number of points these stand on
+    """
+
+    peak_to_valley: float
+    rms: float
+    rms_area_weighted: float
+    points: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Mean deviation over successive stretches; stretches without points are left out.
+
+    It is empty, k = 0, where the cloud does not touch the line.
+
+    position: mean position of the points of a stretch [m], increasing, (k,)
+    value: their mean [m], (k,)
+    points: how many they are, (k,)
+    """
+
+    position: FloatArray
+    value: FloatArray
+    points: IntArray
+
+
+def deviation(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> FloatArray:
+    """Height minus nominal height [m] at x, y [m], each (n,), in the frame of the surface.
+
+    Raises DataError where the cloud is not finite or reaches beyond the nominal surface.
+    """
+    _check(x=x, y=y, height=height)
+    expected = nominal.height(x, y)
+    outside = int(np.sum(~np.isfinite(expected)))
+    if outside:
+        raise DataError(
+            f"{outside} of {len(x)} points lie where the nominal surface {nominal!r} has no "
+            "height; check its parameters and the units of the cloud"
+        )
+    return np.asarray(height - expected, np.float64)
+
+
+def level(
+    x: FloatArray,
+    y: FloatArray,
+    deviation: FloatArray,
+    *,
+    tilt: bool = False,
+    weights: FloatArray | None = None,
+) -> FloatArray:
+    """Deviation (n,) [m] without its least-squares piston, and without tilt if asked for.
+
+    A piston is the unknown stand-off of the probe; remove a tilt only where the part's
+    seat on the spindle is not of interest. ``weights`` (n,) as for :func:`statistics`.
+    """
+    weight = np.ones_like(deviation) if weights is None else weights
+    _check(x=x, y=y, deviation=deviation, weights=weight)
+    # Scaled to the aperture, the three columns are of one size.
+    scale = max(np.ptp(x), np.ptp(y)) or 1.0
+    columns = [np.ones_like(x), x / scale, y / scale] if tilt else [np.ones_like(x)]
+    design = np.column_stack(columns)
+    root = np.sqrt(weight)
+    fitted = np.linalg.lstsq(design * root[:, np.newaxis], deviation * root, rcond=None)[0]
+    return np.asarray(deviation - design @ fitted, np.float64)
+
+
+def spiral_weights(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Area per point of a spiral about the origin, (n,), of mean 1.
+
+    At constant feed and speed the points are uniform in radius and angle, so that the
+    area r·dr·dθ of a point is proportional to its radius.
+    """
+    _check(x=x, y=y)
+    return _mean_one(np.hypot(x, y))
+
+
+def density_weights(x: FloatArray, y: FloatArray, cells: int = 50) -> FloatArray:
+    """Area per point of any cloud, (n,), of mean 1: one over the points in its cell.
+
+    The bounding box is cut into ``cells`` × ``cells``; choose them wide enough to hold
+    several points, or every point weighs the same.
+    """
+    _check(x=x, y=y)
+    if cells < 1:
+        raise DataError(f"cells is {cells!r}, expected 1 or more")
+    cell = _cell_numbers(x, cells) * cells + _cell_numbers(y, cells)
+    return _mean_one(1.0 / np.bincount(cell)[cell])
+
+
+def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
+    """Figures of a deviation (n,) [m] whose points stand for areas ∝ ``weights`` (n,).
+
+    Raises DataError for values that are not finite or weights that are not areas.
+    """
+    _check(deviation=deviation, weights=weights)
+    total = float(np.sum(weights))
+    if np.any(weights < 0) or total <= 0:
+        raise DataError(
+            f"weights from {float(weights.min())!r} to {float(weights.max())!r}, expected areas"
+        )
+    square = np.square(deviation)
+    return FormStatistics(
+        peak_to_valley=float(np.ptp(deviation)),
+        rms=float(np.sqrt(np.mean(square))),
+        rms_area_weighted=float(np.sqrt(np.sum(weights * square) / total)),
+        points=len(deviation),
+    )
+
+
+class RunningStatistics:
+    """Statistics of a cloud that comes in portions, its piston removed as by :func:`level`.
+
+    Weights are radii, as for :func:`spiral_weights`. Exact up to rounding: sums are taken
+    about the first value, for a deviation is small against its stand-off.
+    """
+
+    def __init__(self) -> None:
+        self._points = 0
+        self._start = 0.0
+        self._least, self._most = np.inf, -np.inf
+        # Of weight 1 and of weight radius: Σw, Σw d, Σw d².
+        self._sums = np.zeros((2, 3))
+
+    def add(self, x: FloatArray, y: FloatArray, deviation: FloatArray) -> None:
+        """Take in a portion, each array (n,) [m]."""
+        _check(x=x, y=y, deviation=deviation)
+        if not self._points:
+            self._start = float(deviation[0])
+        shifted = deviation - self._start
+        for row, weight in zip(self._sums, (np.ones_like(x), np.hypot(x, y)), strict=True):
+            weighted = weight * shifted
+            row += weight.sum(), weighted.sum(), weighted @ shifted
+        self._points += len(x)
+        self._least = min(self._least, float(shifted.min()))
+        self._most = max(self._most, float(shifted.max()))
+
+    def statistics(self) -> FormStatistics:
+        """Of all portions so far. Raises DataError if there was none, or all lie at the centre."""
+        (count, plain, plain_square), (total, weighted, weighted_square) = self._sums
+        if not total > 0:
+            raise DataError(f"{self._points} points, none of them off the spindle axis")
+        piston = weighted / total
+        mean_square = (plain_square - 2 * piston * plain) / count + piston**2
+        return FormStatistics(
+            peak_to_valley=self._most - self._least,
+            rms=float(np.sqrt(max(mean_square, 0.0))),
+            rms_area_weighted=float(np.sqrt(max(weighted_square / total - piston**2, 0.0))),
+            points=self._points,
+        )
+
+
+def line_profile(
+    x: FloatArray,
+    y: FloatArray,
+    deviation: FloatArray,
+    *,
+    angle: float = 0.0,
+    half_width: float,
+    spacing: float,
+) -> Profile:
+    """Profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
+
+    Points up to ``half_width`` [m] beside the line are averaged over every ``spacing`` [m].
+    """
+    _check(x=x, y=y, deviation=deviation)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    across = y * np.cos(angle) - x * np.sin(angle)
+    near = np.abs(across) <= half_width
+    return _averaged(along[near], deviation[near], spacing)
+
+
+def radial_profile(
+    x: FloatArray, y: FloatArray, deviation: FloatArray, *, spacing: float
+) -> Profile:
+    """Mean over rings of width ``spacing`` [m] about the origin: what a turned part repeats.
+
+    Each of 12 directions counts alike, and a ring that was not seen in all of them is left
+    out: over a part of a turn the errors of the other orders would not average to zero.
+    Choose ``spacing`` wider than the feed per turn.
+    """
+    _check(x=x, y=y, deviation=deviation)
+    radius = np.hypot(x, y)
+    ring = _stretches(radius, spacing)
+    sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
+    cell = ring * _SECTORS + sector
+    shape = (int(ring.max()) + 1, _SECTORS)
+    points, radii, values = (
+        np.bincount(cell, part, shape[0] * shape[1]).reshape(shape)
+        for part in (None, radius, deviation)
+    )
+    whole = np.all(points > 0, axis=1)
+    return Profile(
+        position=np.mean(radii[whole] / points[whole], axis=1),
+        value=np.mean(values[whole] / points[whole], axis=1),
+        points=np.sum(points[whole], axis=1).astype(np.int64),
+    )
+
+
+def _averaged(position: FloatArray, value: FloatArray, spacing: float) -> Profile:
+    stretch = _stretches(position, spacing)
+    filled, index, points = np.unique(stretch, return_inverse=True, return_counts=True)
+    return Profile(
+        position=np.bincount(index, position, len(filled)) / points,
+        value=np.bincount(index, value, len(filled)) / points,
+        points=points.astype(np.int64),
+    )
+
+
+def _stretches(position: FloatArray, spacing: float) -> IntArray:
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise DataError(f"spacing of a profile is {spacing!r} m, expected a positive number")
+    extent = float(np.max(np.abs(position), initial=0.0)) / spacing
+    if extent > _MOST_STRETCHES:
+        raise DataError(
+            f"spacing {spacing!r} m cuts the profile into {extent:.0f} stretches; widen it"
+        )
+    return np.asarray(np.floor(position / spacing), np.int64)
+
+
+def _cell_numbers(values: FloatArray, cells: int) -> IntArray:
+    span = np.ptp(values) or 1.0
+    number = (values - values.min()) / span * cells
+    return np.asarray(np.minimum(number, cells - 1), np.int64)
+
+
+def _mean_one(weights: FloatArray) -> FloatArray:
+    mean = float(np.mean(weights))
+    return weights / mean if mean > 0 else np.ones_like(weights)
+
+
+def _check(**arrays: FloatArray) -> None:
+    lengths = {name: np.shape(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
+        raise DataError(f"form: arrays of shapes {lengths!r}, expected one row of one length each")
+    for name, array in arrays.items():
+        if not len(array):
+            raise DataError(f"form: {name} is empty")
+        bad = int(np.sum(~np.isfinite(array)))
+        if bad:
+            raise DataError(
+                f"form: {bad} of {len(array)} values of {name} are not finite; drop and count them"
+            )

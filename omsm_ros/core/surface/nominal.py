@@ -1,0 +1,109 @@
+"""Nominal surfaces: height and slope over the workpiece plane.
+
+A surface is described in the workpiece frame of the scan: x, y in the plane of the
+chuck, height along the spindle axis, all in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import SurfaceError
+
+
+@dataclass(frozen=True, slots=True)
+class Flat:
+    """A plane at constant ``level`` [m]."""
+
+    level: float = 0.0
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height [m] at x, y [m]."""
+        return np.full(np.broadcast(x, y).shape, self.level)
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A sphere of ``radius`` [m] touching the plane at the origin; concave if positive."""
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.radius) or self.radius == 0:
+            raise SurfaceError(f"sphere radius {self.radius!r} m, expected a nonzero number")
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height [m]; NaN outside the sphere's equator."""
+        square = np.asarray(x) ** 2 + np.asarray(y) ** 2
+        root = np.sqrt(np.maximum(self.radius**2 - square, 0.0))
+        sag = np.sign(self.radius) * square / (abs(self.radius) + root)
+        return np.where(square <= self.radius**2, sag, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class OffAxisParaboloid:
+    """A piece of a paraboloid, its height taken along the normal at its centre.
+
+    parent_focal_length: f of the parent ``Z = R²/4f`` [m]
+    off_axis_distance: from the parent's axis to the centre of the piece [m]
+
+    x points away from the parent's axis. With slope ``m = d/2f`` at the centre and
+    ``q² = 1 + m²``, a point (u, v, w) of the tangent frame lies on the parent where
+    ``4 f q w = ((u - m w)/q)² + v²``; the smaller root of this quadratic is the height.
+    """
+
+    parent_focal_length: float
+    off_axis_distance: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.parent_focal_length) and self.parent_focal_length > 0):
+            raise SurfaceError(
+                f"parent_focal_length {self.parent_focal_length!r} m, expected a positive number"
+            )
+        if not np.isfinite(self.off_axis_distance):
+            raise SurfaceError(f"off_axis_distance {self.off_axis_distance!r} m is not finite")
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height [m] at x, y [m]."""
+        slope = self.off_axis_distance / (2 * self.parent_focal_length)
+        q2 = 1 + slope**2
+        a = slope**2 / q2
+        b = 2 * slope / q2 * np.asarray(x) + 4 * self.parent_focal_length * np.sqrt(q2)
+        c = np.square(x) / q2 + np.square(y)
+        # 2c / (b + √…) is the small root without the cancellation of (b - √…) / 2a.
+        return np.asarray(2 * c / (b + np.sqrt(b**2 - 4 * a * c)), np.float64)
+
+
+PAPER_MIRROR = OffAxisParaboloid(parent_focal_length=25.4e-3, off_axis_distance=50.8e-3)
+"""The paper's mirror: 90° off-axis paraboloid of 50.8 mm effective focal length."""
+
+PAPER_MIRROR_RADIUS_M = 12.7e-3
+
+_SHAPES: dict[str, type[Flat] | type[Sphere] | type[OffAxisParaboloid]] = {
+    "flat": Flat,
+    "sphere": Sphere,
+    "off_axis_paraboloid": OffAxisParaboloid,
+}
+
+
+def surface_from_description(description: Mapping[str, object]) -> Surface:
+    """Build a surface from ``{"shape": name, parameter: metres, …}``.
+
+    Raises SurfaceError naming an unknown shape, or an unknown, missing or non-numeric parameter.
+    """
+    parameters = dict(description)
+    shape = parameters.pop("shape", None)
+    if not isinstance(shape, str) or shape not in _SHAPES:
+        raise SurfaceError(f"shape {shape!r} is unknown, expected one of {sorted(_SHAPES)}")
+    for name, value in parameters.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise SurfaceError(f"{shape}: {name} is {value!r}, expected a number in metres")
+    try:
+        return _SHAPES[shape](**parameters)  # type: ignore[arg-type]
+    except TypeError as err:
+        raise SurfaceError(f"{shape}: {err}".replace("__init__() ", "")) from err

@@ -1,0 +1,1 @@
+"""Is a calibration true? Free paths, reversal, change, repeatability."""

@@ -1,0 +1,65 @@
+"""How far is the probe from the model on a free path? The paper's Fig. 9."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.samples.blocks import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PathCheck:
+    """The paper's Fig. 9 for one free path, arrays (n,) but the summary.
+
+    frequency: instantaneous [Hz];  error_before, error_after: [m]
+    lag_before, lag_after: of the probe behind the encoder, and behind the model [rad]
+    rms_before, rms_after: [m]
+    """
+
+    frequency: FloatArray
+    error_before: FloatArray
+    error_after: FloatArray
+    lag_before: FloatArray
+    lag_after: FloatArray
+    rms_before: float
+    rms_after: float
+
+
+def check_path(
+    z: FloatArray,
+    distance: FloatArray,
+    predicted: FloatArray,
+    static_gain: float,
+    sample_period: float,
+) -> PathCheck:
+    """Instantaneous error and Hilbert phase lag before and after correction.
+
+    z: encoder [m];  distance: probe on a fixed target [m];  predicted: G_m z [m], all (n,)
+    The probe's own view of the motion is -distance / static_gain, apart from its offset.
+    """
+    seen = -(distance / static_gain)
+    before = _centred(z - seen)
+    after = _centred(predicted - seen)
+    turning = signal.hilbert(_centred(z))
+    phase = np.unwrap(np.angle(turning))
+    return PathCheck(
+        frequency=np.gradient(phase) / (2 * np.pi * sample_period),
+        error_before=before,
+        error_after=after,
+        lag_before=_lag(z, seen),
+        lag_after=_lag(predicted, seen),
+        rms_before=float(np.sqrt(np.mean(before**2))),
+        rms_after=float(np.sqrt(np.mean(after**2))),
+    )
+
+
+def _centred(values: FloatArray) -> FloatArray:
+    return np.asarray(values - np.mean(values))
+
+
+def _lag(ahead: FloatArray, behind: FloatArray) -> FloatArray:
+    ratio = signal.hilbert(_centred(ahead)) * np.conj(signal.hilbert(_centred(behind)))
+    return np.asarray(np.angle(ratio))

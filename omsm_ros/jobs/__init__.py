@@ -1,0 +1,1 @@
+"""One whole task a file, shared by commands and nodes."""

@@ -1,0 +1,46 @@
+"""The certificate of a calibration as files to keep: a page, its Markdown, and the plots."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+
+from omsm_ros import __version__
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.identification.explained import explain
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.report.certificate.markdown import picture_name, render_markdown
+from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
+from omsm_ros.storage.files import whole_file
+
+PAGE, MARKDOWN = "certificate.html", "certificate.md"
+
+
+def write_certificate(
+    out: Path,
+    calibration: Calibration,
+    record: MotionRecord | None = None,
+    *,
+    input: str = "encoder",
+    source: str = "",
+) -> Path:
+    """Write certificate.html, certificate.md and its plots into ``out``; return the page's path.
+
+    record: what the calibration was identified from, for the figures that show data
+    input: as it was given to the identification;  source: name of the recording
+    """
+    explained = None if record is None else explain(record, calibration, input)
+    certificate = CertificatePage(
+        calibration,
+        datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        source,
+        __version__,
+        certificate_figures_of(calibration, explained),
+    )
+    files = {picture_name(name): picture for name, picture in certificate.figures.items()}
+    files[MARKDOWN] = render_markdown(certificate).encode("utf-8", "replace")
+    files[PAGE] = render(certificate).encode("utf-8", "replace")
+    for name, content in files.items():
+        with whole_file(out / name) as stream:
+            stream.write(content)
+    return out / PAGE

@@ -1,0 +1,257 @@
+"""The demonstration: what is to be done with the emulated cell, and what came of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import OmsmError
+from omsm_ros.jobs import measure as measurement
+from omsm_ros.jobs import publish as publication
+from omsm_ros.jobs.correct_bag import correct_bag
+from omsm_ros.report.common import response_figures, style
+from omsm_ros.report.measurement.cloud_view import CloudView
+from omsm_ros.report.measurement.figures import overview_figure
+from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.storage import bags
+from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
+from omsm_ros.twin.cell import Probe, Recording
+from omsm_ros.twin.plant import Plant
+from omsm_ros.twin.scenario import Scenario, scan_of, spiral_of, step_test_of
+from omsm_ros.twin.truth import TruthComparison, departure_from_truth
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
+
+# The step test begins at rest.
+_REST_SAMPLES = 100
+RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
+TITLE = "Paraboloid mirror measured on the emulated cell"
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """Where the results go, and how the twin is set.
+
+    time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
+    """
+
+    out: Path
+    seed: int = 1
+    time_lapse: float = 20.0
+    start_radius: float = 12.7e-3
+    sample_period: float = field(default=1e-3, init=False)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What the emulated cell does."""
+        return Scenario(
+            seed=self.seed, start_radius=self.start_radius, sample_period=self.sample_period
+        )
+
+    @property
+    def calibration_file(self) -> Path:
+        """Written by the calibrator node."""
+        return self.out / "calibration.json"
+
+    @property
+    def bag(self) -> Path:
+        """Written by the recorder node."""
+        return self.out / "scan.mcap"
+
+    @property
+    def link(self) -> str:
+        """The emulated serial port."""
+        return str((self.out / "cell").absolute())
+
+    @property
+    def step_test_samples(self) -> int:
+        """Samples of the step test."""
+        return len(step_test_of(self.scenario).axes)
+
+    @property
+    def scan_samples(self) -> int:
+        """Samples of the scan."""
+        return round(spiral_of(self.scenario).duration / self.sample_period)
+
+    def emulator_parameters(self) -> dict[str, object]:
+        """ROS parameters of the emulator."""
+        return {
+            "time_lapse": self.time_lapse,
+            "seed": self.seed,
+            "start_radius": self.start_radius,
+            "sample_period": self.sample_period,
+        }
+
+    def settings(self) -> dict[str, object]:
+        """What the calibration will belong to."""
+        return {
+            "machine": "digital twin of the paper's cell",
+            "fixture": "twin",
+            "probe_rate_hz": 1 / self.sample_period,
+            "seed": self.seed,
+        }
+
+    def prepare(self) -> None:
+        """Make the folder and clear it of an earlier run's results."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
+        for path in stale:
+            if path.is_dir():
+                raise OmsmError(f"{str(path)!r} is a folder and stands in the way; remove it")
+            path.unlink(missing_ok=True)
+        for log in (self.out / "log").glob("*.log"):
+            log.unlink()
+
+
+OVERVIEW = "overview.png"
+_RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
+
+
+def conclude(plan: Demonstration) -> dict[str, Any]:
+    """Correct the recorded bag offline, compare with the truth, write all results."""
+    calibration = load_calibration(plan.calibration_file)
+    done = correct_bag(plan.bag, calibration, plan.out / CLOUD)
+    stored = CloudFile(plan.out / CLOUD)
+    cloud = stored.read()
+    view = publication.view_of(cloud, plan.sample_period)
+    if view is None:
+        raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
+    recording = scan_of(plan.scenario)
+    summary = measurement.summarise(plan.bag, done, stored, calibration, PAPER_MIRROR)
+    summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
+    summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
+    summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
+    summary["response"] = response_errors(calibration, Plant().dynamics)
+    summary["live_equals_offline"] = same_points(live_points(plan.bag), cloud)
+    index = cloud["sample"].astype(np.int64)
+    figures = surface_figures(
+        view,
+        PAPER_MIRROR,
+        true_height=recording.surface_height[index],
+        true_error_left=(recording.probe_motion - recording.axes.z)[index] + view.dynamic_error,
+    )
+    figures |= calibration_figures(calibration, step_test_of(plan.scenario))
+    (plan.out / OVERVIEW).write_bytes(overview(view, calibration))
+    save_json(plan.out / SUMMARY, summary)
+    publication.publish(plan.out, TITLE, summary, calibration, figures)
+    return summary
+
+
+def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
+    """Entries of the summary that only the twin's truth can give; lengths in metres."""
+    truth: TruthComparison = departure_from_truth(
+        recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
+    )
+    probe = Probe()
+    floor = float(np.hypot(probe.noise, probe.resolution / np.sqrt(12)))
+    entries = asdict(truth)
+    entries["surface_deviation"]["probe_noise_and_resolution"] = floor
+    return entries
+
+
+def response_errors(calibration: Calibration, true: TransferFunction) -> list[dict[str, float]]:
+    """Identified against true response: relative gain error [1], phase error [deg]."""
+    frequency = np.array(RESPONSE_FREQUENCIES_HZ)
+    ratio = calibration.dynamics.response(frequency) / true.response(frequency)
+    gain, phase = np.abs(ratio) - 1, np.angle(ratio, deg=True)
+    return [
+        {"frequency": float(f), "gain_error": float(g), "phase_error_deg": float(p)}
+        for f, g, p in zip(frequency, gain, phase, strict=True)
+    ]
+
+
+def overview(view: CloudView, calibration: Calibration) -> bytes:
+    """One wide picture: map before in µm, after in nm, identified and true response."""
+    weights = form.spiral_weights(view.x, view.y)
+    raw, corrected = (
+        form.level(view.x, view.y, form.deviation(view.x, view.y, h, PAPER_MIRROR), weights=weights)
+        for h in (view.raw_height, view.height)
+    )
+    figure = overview_figure(view.x, view.y, raw, corrected, calibration, Plant().dynamics)
+    return style.png(figure, dpi=120)
+
+
+def live_points(bag: Path) -> NDArray[np.void]:
+    """All points the corrector node published while ``bag`` was recorded, in order."""
+    with bags.BagReader(bag) as reader:
+        clouds = [points for _, points in reader.records(bags.POINTS_TOPIC)]
+    return np.concatenate(clouds) if clouds else np.empty(0, np.dtype(list(CLOUD_FIELDS)))
+
+
+def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
+    """True if every field of every point is the same to the last bit."""
+    return len(live) == len(stored) and all(
+        live[name].tobytes() == stored[name].tobytes() for name, _ in CLOUD_FIELDS
+    )
+
+
+def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
+    """Bode plot against the truth, and what the model makes of the step test."""
+    axes, period = step.axes, calibration.sample_period
+    recursion = Recursion(discretise(calibration.dynamics, period))
+    recursion.start(past_motion(axes.z[:_REST_SAMPLES]))
+    edges = response_figures.step_response(
+        np.arange(len(axes)) * period,
+        axes.z,
+        -step.distance.distance / calibration.static_gain,
+        recursion.run(axes.z),
+    )
+    bode = response_figures.bode(calibration, Plant().dynamics, period)
+    return {"bode": style.png(bode), "step_response": style.png(edges)}
+
+
+# ----------------------------------------------------------------------------------- table
+
+
+def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
+    """The result for the terminal."""
+    rows = [*_sample_rows(summary), *_accuracy_rows(summary)]
+    width = max(len(name) for name, _ in rows)
+    body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
+    files = ", ".join(summary["files"].values())
+    return f"\n{TITLE}\n\n{body}\n\n  in {os.path.relpath(plan.out)}: {files}\n"
+
+
+def _sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    for stream, account in summary["samples"].items():
+        reasons = "".join(f", {n} {reason}" for reason, n in account["counted"].items() if n)
+        value = f"{account['received']} received, {account['corrected']} corrected{reasons}"
+        yield f"samples of {stream}", value
+    yield "live cloud equals offline", "to the last bit" if summary["live_equals_offline"] else "NO"
+
+
+def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    before, after = summary["dynamic_error_before"], summary["dynamic_error_after"]
+    yield "dynamic error before", _spread(before, MICROMETRE_M, "µm")
+    yield "  after correction", _spread(after, NANOMETRE_M, "nm")
+    surface = summary["surface_deviation"]
+    floor = surface["probe_noise_and_resolution"] / NANOMETRE_M
+    yield (
+        "cloud from true surface",
+        f"rms {surface['rms'] / NANOMETRE_M:.2f} nm; the probe alone has {floor:.2f} nm",
+    )
+    for row in summary["response"]:
+        yield (
+            f"G at {row['frequency']:g} Hz, off by",
+            f"{row['gain_error'] / PPM:+.2f} ppm, {row['phase_error_deg']:+.5f}°",
+        )
+
+
+def _spread(spread: dict[str, float], unit: float, name: str) -> str:
+    pv, rms = spread["peak_to_valley"] / unit, spread["rms"] / unit
+    return f"{pv:.3f} {name} PV, {rms:.3f} {name} rms (by area)"

@@ -1,0 +1,38 @@
+"""The motion in a bag, ready to identify from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omsm_ros.core.samples.blocks import Block
+from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.errors import BagError
+from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
+from omsm_ros.storage import bags
+
+# ------------------------------------------------------------------------ identification
+
+
+def motion_of_bag(
+    path: Path, *, duration: float = 0.0, progress: Progress = no_progress
+) -> MotionRecord:
+    """The motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
+
+    The reference sensor is used where it was recorded.
+    """
+    topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
+    with bags.BagReader(path) as bag:
+        if any(t.topic == bags.REFERENCE_TOPIC and t.messages for t in bag.topics()):
+            topics.append(bags.REFERENCE_TOPIC)
+    blocks = read_blocks(path, topics, progress)
+    if not blocks[bags.AXES_TOPIC] or not blocks[bags.DISTANCE_TOPIC]:
+        raise BagError(f"{str(path)!r} has its topics but no samples on them; record a step test")
+    axes, distance, *reference = (_beginning(blocks[topic], duration) for topic in topics)
+    return assemble(axes, distance, *reference)  # type: ignore[arg-type]
+
+
+def _beginning(blocks: list[Block], duration: float) -> list[Block]:
+    if duration == 0 or not blocks:
+        return blocks
+    end = blocks[0].first_sample + duration / blocks[0].sample_period
+    return [block for block in blocks if block.first_sample < end]

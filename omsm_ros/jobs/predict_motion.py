@@ -1,0 +1,26 @@
+"""What will a motion cost? The prediction for a bag or for positions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.correction.predict import Prediction, predict_error
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.blocks import (
+    FloatArray,
+)
+from omsm_ros.errors import CalibrationError
+from omsm_ros.jobs.read_bag import motion_in
+
+
+def predict_from(
+    calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
+) -> Prediction:
+    """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty."""
+    if calibration is None:
+        raise CalibrationError("no calibration in use; call identify or load one")
+    if bag:
+        z, sample_period = motion_in(Path(bag))
+    return predict_error(calibration, np.asarray(z, np.float64), sample_period)

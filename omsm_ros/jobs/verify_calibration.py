@@ -1,0 +1,40 @@
+"""Does a calibration hold on a free path? The paper's Fig. 9 from a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.verification.free_path import PathCheck, check_path
+from omsm_ros.jobs.identify_bag import motion_of_bag
+from omsm_ros.jobs.read_bag import Progress, no_progress
+
+_START_SAMPLES = 12
+
+
+def path_check_of(
+    path: Path, calibration: Calibration, progress: Progress = no_progress
+) -> PathCheck:
+    """The paper's Fig. 9: errors and phase lags of a free path on a fixed target."""
+    record = motion_of_bag(path, progress=progress)
+    recursion = Recursion(discretise(calibration.dynamics, record.sample_period))
+    recursion.start(past_motion(record.z[:_START_SAMPLES]))
+    return check_path(
+        record.z,
+        _bridged(record),
+        recursion.run(record.z),
+        calibration.static_gain,
+        record.sample_period,
+    )
+
+
+def _bridged(record: MotionRecord) -> FloatArray:
+    """Distance with its dropouts bridged by straight lines: the Hilbert transform needs no gaps."""
+    index = np.arange(len(record))
+    return np.interp(index, index[record.ok], record.distance[record.ok])

@@ -1,0 +1,215 @@
+"""Figures of a certificate: the response with its band, what the model leaves, the order.
+
+Every function returns a matplotlib Figure that belongs to the caller; all arguments are SI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR
+from omsm_ros.core.identification.explained import (
+    EdgeMean,
+    Explained,
+    autocorrelation,
+    mean_at_edges,
+)
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.report.common import style
+from omsm_ros.report.common.response_figures import bode
+from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOMETRE_M
+
+_COHERENT = 0.5
+# Points on a logarithmic axis: more than these a decade would be a smear.
+_POINTS_PER_DECADE = 12
+_LAGS = 25
+_LEAST_SINGULAR = 1e-3
+_LIMIT: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+_SPAN: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
+_BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
+
+
+def response_with_band(calibration: Calibration, seen: FrequencyResponse | None = None) -> Figure:
+    """Bode plot with its 95 % band, and the points of an estimate without a model."""
+    made = bode(calibration, None, calibration.sample_period)
+    made.set_size_inches(7.4, 5.45)
+    gain, phase, _ = made.get_axes()
+    style.label(gain, y=gain.get_ylabel(), title="Response")
+    if seen is not None:
+        _draw_points(gain, phase, thinned(seen))
+    style.legend_above(gain)
+    if calibration.valid_up_to < gain.get_xlim()[1]:
+        phase.annotate(
+            f"{calibration.valid_up_to:.3g} Hz", (calibration.valid_up_to, 0), (-3, 3),
+            ("data", "axes fraction"), "offset points", ha="right", va="bottom",
+            fontsize=style.TEXT_PT, color=style.MUTED,
+        )  # fmt: skip
+    return made
+
+
+def _draw_points(gain: Axes, phase: Axes, seen: FrequencyResponse) -> None:
+    size, spread = np.abs(seen.response), COVERAGE_FACTOR * seen.uncertainty
+    angle = np.angle(seen.response) / DEGREE_RAD
+    # An angle is known to a whole turn only: on that of the curve.
+    curve = np.interp(seen.frequency, *phase.get_lines()[0].get_data())
+    angle += 360.0 * np.round((curve - angle) / 360.0)
+    look: dict[str, Any] = {
+        "fmt": "o", "markersize": 2.6, "color": style.BEFORE, "elinewidth": 0.8, "alpha": 0.8,
+    }  # fmt: skip
+    # An estimate that scatters far outside must not flatten the identified curve.
+    for axes in (gain, phase):
+        axes.set_autoscaley_on(False)
+    gain.errorbar(seen.frequency, size, size * spread, label="without a model, 95 %", **look)
+    phase.errorbar(seen.frequency, angle, spread / DEGREE_RAD, **look)
+
+
+def thinned(seen: FrequencyResponse) -> FrequencyResponse:
+    """Coherent lines above zero frequency, those close together averaged by their weight."""
+    good = (seen.frequency > 0) & (seen.coherence > _COHERENT)
+    frequency = seen.frequency[good]
+    group = np.floor(_POINTS_PER_DECADE * np.log10(np.maximum(frequency, 1e-12)))
+    _, place = np.unique(group, return_inverse=True)
+    weight = 1 / np.maximum(seen.uncertainty[good], 1e-9) ** 2
+    total = np.bincount(place, weight)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(place, weight * values) / total)
+
+    response = seen.response[good]
+    return FrequencyResponse(
+        mean(frequency),
+        mean(response.real) + 1j * mean(response.imag),
+        mean(seen.coherence[good]),
+        1 / np.sqrt(total),
+    )
+
+
+def residual(explained: Explained, noise: float | None) -> Figure:
+    """What the model leaves: over the recording, at the mean edge, and its correlation.
+
+    noise: standard deviation of a reading [m], for comparison, or None
+    """
+    at_edges = mean_at_edges(explained, _BEFORE_EDGE_S, _AFTER_EDGE_S)
+    made, axes = style.figure(6.1, 5.6, rows=2 + (at_edges is not None))
+    _draw_over_time(axes[0, 0], explained, noise)
+    if at_edges is not None:
+        _draw_at_edges(axes[1, 0], at_edges, noise)
+    _draw_correlation(axes[-1, 0], explained.residual)
+    made.align_ylabels()
+    return made
+
+
+def _draw_over_time(axes: Axes, explained: Explained, noise: float | None) -> None:
+    known = np.isfinite(explained.residual)
+    at, low, high = style.envelope(explained.time[known], explained.residual[known] / NANOMETRE_M)
+    axes.fill_between(at, low, high, color=style.AFTER, linewidth=0.5)
+    if noise is not None:
+        for sign in (-1, 1):
+            label = "±2 × noise at rest" if sign > 0 else None
+            axes.axhline(2 * sign * noise / NANOMETRE_M, label=label, **_LIMIT)
+        style.legend_above(axes)
+    axes.margins(x=0.01)
+    style.label(axes, x="time [s]", y="residual [nm]", title="Residual")
+
+
+def _draw_at_edges(axes: Axes, mean: EdgeMean, noise: float | None) -> None:
+    time = mean.time / MILLISECOND_S
+    if noise is not None:
+        bound = COVERAGE_FACTOR * noise / np.sqrt(mean.edges) / NANOMETRE_M
+        axes.axhspan(-bound, bound, label="95 % of noise", **_SPAN)
+        style.legend_above(axes)
+    axes.plot(time, mean.mean / NANOMETRE_M, color=style.AFTER, linewidth=1.2)
+    axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
+    axes.margins(x=0.01)
+    count = f"{mean.edges} edges" if mean.edges > 1 else "one edge"
+    style.label(
+        axes, x="time since the middle of the edge [ms]", y="residual [nm]",
+        title=f"Mean of {count}",
+    )  # fmt: skip
+
+
+def _draw_correlation(axes: Axes, left: FloatArray) -> None:
+    lags = np.arange(1, _LAGS + 1)
+    bound = COVERAGE_FACTOR / np.sqrt(max(int(np.sum(np.isfinite(left))), 1))
+    axes.axhspan(-bound, bound, label="95 % if white", **_SPAN)
+    correlation = autocorrelation(left, _LAGS)
+    axes.vlines(lags, 0, correlation, color=style.AFTER, linewidth=1.4)
+    axes.plot(lags, correlation, "o", color=style.AFTER, markersize=3)
+    axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
+    largest = 1.25 * max(float(np.max(np.abs(correlation))), 1.5 * bound)
+    axes.set_ylim(-largest, largest)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.legend_above(axes)
+    style.label(axes, x="lag [samples]", y="correlation [1]", title="Its autocorrelation")
+
+
+def order(
+    singular_values: Sequence[float],
+    candidates: Sequence[Mapping[str, float]],
+    chosen: int | None,
+) -> Figure:
+    """The votes on the order: singular values beside their noise, and what each candidate leaves.
+
+    singular_values: in units of the largest that noise would give;  may be empty
+    candidates: ``parameters``, ``rms_m`` and ``bic`` of each;  chosen: index of one of them
+    """
+    shown = [bool(len(singular_values)), bool(candidates)]
+    made, axes = style.figure(12.4, 2.7, columns=max(sum(shown), 1))
+    places = iter(axes[0])
+    if shown[0]:
+        _draw_singular_values(next(places), np.asarray(singular_values, np.float64))
+    if shown[1]:
+        _draw_candidates(next(places), candidates, chosen)
+    return made
+
+
+def _draw_singular_values(axes: Axes, values: FloatArray) -> None:
+    index = np.arange(1, len(values) + 1)
+    out = values > 1
+    _plain_log(axes)
+    # A decade at least, and a value of zero at its foot.
+    low, high = min(0.1, float(np.min(values)) / 1.5), max(10.0, 1.5 * float(np.max(values)))
+    axes.set_ylim(max(low, _LEAST_SINGULAR), high)
+    axes.axhline(1.0, label="limit of noise", **_LIMIT)
+    for inside, colour, text in ((out, style.AFTER, "state"), (~out, style.MUTED, "noise")):
+        if np.any(inside):
+            axes.plot(index[inside], values[inside], "o", color=colour, markersize=5, label=text)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.legend_above(axes)
+    style.label(axes, x="number", y="over the limit [1]", title="Singular values")
+
+
+def _draw_candidates(
+    axes: Axes, candidates: Sequence[Mapping[str, float]], chosen: int | None
+) -> None:
+    size = np.asarray([c["parameters"] for c in candidates])
+    rms = np.asarray([c["rms_m"] for c in candidates]) / NANOMETRE_M
+    if rms.max() > 3 * rms.min() > 0:
+        _plain_log(axes)
+    axes.plot(size, rms, "o", color=style.MUTED, markersize=4, label="tried")
+    best = int(np.argmin([c["bic"] for c in candidates]))
+    axes.plot(
+        size[best], rms[best], "o", markersize=9, markerfacecolor="none",
+        markeredgecolor=style.TRUTH, label="lowest BIC",
+    )  # fmt: skip
+    if chosen is not None:
+        axes.plot(size[chosen], rms[chosen], "o", color=style.AFTER, markersize=6, label="chosen")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.legend_above(axes)
+    style.label(axes, x="parameters of the dynamics", y="residual rms [nm]", title="Candidates")
+
+
+def _plain_log(axes: Axes) -> None:
+    """A logarithmic axis labelled 1, 2, 5, 10."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())

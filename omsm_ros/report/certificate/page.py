@@ -1,0 +1,285 @@
+"""The certificate of a calibration as a page to file: HTML in one piece, or Markdown."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import jinja2
+import numpy as np
+
+from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
+from omsm_ros.core.identification.explained import Explained
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.report.certificate import figures as certificate_figures
+from omsm_ros.report.certificate import reading as reading
+from omsm_ros.report.certificate import tables as tables
+from omsm_ros.report.common import style
+from omsm_ros.report.common.measured import measured, number, plain
+from omsm_ros.report.common.response_figures import step_response
+from omsm_ros.report.common.tables import NOTHING, Table, mapping_table, quantity
+from omsm_ros.report.common.verdict import Verdict
+from omsm_ros.report.measurement.page import Headline
+from omsm_ros.units import DEGREE_RAD, PPM
+
+BAND = "band"
+CAPTIONS = {
+    BAND: (
+        "Gain, phase, and the error of a sinusoidal motion before and after the correction. "
+        "Grey: not trusted."
+    ),
+    "step": "The steepest move: what carriage and probe did, and what the model leaves of it.",
+    "residual": (
+        "What the model leaves over the whole recording, at the edges on top of each other "
+        "(downward ones turned over), and from sample to sample."
+    ),
+    "order": (
+        "Singular values above the limit are states that stand out of the noise. "
+        "Each candidate is a structure that was fitted to the same samples."
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CertificatePage:
+    """Everything on the page; what is absent leaves no hole.
+
+    date: of issue, as it is to be printed
+    source: the recording that it was identified from, for a reader
+    version: of the software
+    figures: PNG files by the names in :data:`CAPTIONS`
+
+    Raises ConfigurationError for a figure of another name.
+    """
+
+    calibration: Calibration
+    date: str
+    source: str = ""
+    version: str = ""
+    figures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.figures) - set(CAPTIONS))
+        if unknown:
+            raise ConfigurationError(
+                f"figures {unknown!r} have no place on the page, expected of {[*CAPTIONS]}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Figures beside each other, then tables; ``note`` is for the reader."""
+
+    title: str
+    figures: tuple[str, ...]
+    tables: tuple[Table, ...]
+    note: str = ""
+
+
+def certificate_figures_of(
+    calibration: Calibration, explained: Explained | None = None
+) -> dict[str, bytes]:
+    """PNG files for the page; those that show data only where there are data."""
+    certificate = calibration.certificate
+    seen = explained.measured if explained is not None else None
+    made = {BAND: certificate_figures.response_with_band(calibration, seen)}
+    if explained is not None:
+        noise = number(certificate.get("noise_m"))
+        made["step"] = step_response(
+            explained.time, explained.carriage, _bridged(explained), explained.modelled
+        )
+        made["residual"] = certificate_figures.residual(explained, noise)
+    candidates = [c for c in tables.listed(certificate, "candidates") if _comparable(c)]
+    values = tables.numbers(certificate, "singular_values")
+    if values or candidates:
+        chosen = [i for i, c in enumerate(candidates) if tables.is_chosen(c, certificate)]
+        sized = [{**c, "parameters": c["poles"] + c["zeros"] + c["delay"]} for c in candidates]
+        made["order"] = certificate_figures.order(values, sized, chosen[0] if chosen else None)
+    return {name: style.png(figure) for name, figure in made.items()}
+
+
+def _comparable(candidate: Mapping[str, object]) -> bool:
+    counted = all(isinstance(candidate.get(key), int) for key in ("poles", "zeros", "delay"))
+    return counted and all(number(candidate.get(key)) is not None for key in ("rms_m", "bic"))
+
+
+def _bridged(explained: Explained) -> FloatArray:
+    """Matplotlib leaves gaps at NaN by itself; the median that aligns an edge does not."""
+    return np.asarray(np.where(np.isfinite(explained.seen), explained.seen, explained.modelled))
+
+
+def render(certificate: CertificatePage) -> str:
+    """The page as HTML; all text from outside is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("omsm_ros.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("certificate.html").render(
+        certificate=certificate,
+        verdict=verdict_on_calibration(certificate.calibration),
+        headlines=headlines(certificate.calibration),
+        sections=sections(certificate),
+        band=BAND,
+        picture=lambda name: b64encode(certificate.figures[name]).decode(),
+        caption=CAPTIONS.__getitem__,
+    )
+
+
+def verdict_on_calibration(calibration: Calibration) -> Verdict:
+    """The certificate's own verdict, and why."""
+    stated, reasons = verdict_of(calibration)
+    if stated == REJECTED:
+        return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
+    if not stated:
+        return Verdict("unknown", "Not judged", ("the calibration has no certificate",))
+    level = "good" if stated.startswith("accepted") else "unknown"
+    return Verdict(level, stated[:1].upper() + stated[1:], (*reasons, *_grounds(calibration)))
+
+
+def _grounds(calibration: Calibration) -> list[str]:
+    certificate, found = calibration.certificate, []
+    if number(certificate.get("chi_square")) is not None:
+        found.append(
+            f"where the axis moves, only noise is left (χ² = {plain(certificate['chi_square'])})"
+        )
+    if np.any(calibration.covariance):
+        top = quantity(calibration.valid_up_to, "Hz")
+        found.append(f"up to {top} the 95 % band is within {_band_text(calibration)}")
+    hidden = number(certificate.get("inter_sample_delay_bound_s"))
+    if hidden is not None:
+        found.append(
+            f"motion between samples hides a lag of {quantity(hidden, 's', 2)} at most"
+            if hidden
+            else "no motion is hidden between samples"
+        )
+    return found
+
+
+def _band_text(calibration: Calibration) -> str:
+    """Greatest half-width of the 95 % band below ``valid_up_to``."""
+    at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
+    band = response_band(calibration.dynamics, calibration.covariance, at)
+    gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
+    return f"±{plain(100 * gain, 2)} % in gain and ±{plain(phase / DEGREE_RAD, 2)}° in phase"
+
+
+def headlines(calibration: Calibration) -> list[Headline]:
+    """The numbers that a reader looks for first, those that are known."""
+    return [h for h in _all_headlines(calibration) if h.value != NOTHING]
+
+
+def _all_headlines(calibration: Calibration) -> list[Headline]:
+    certificate, dynamics = calibration.certificate, calibration.dynamics
+    delay = measured(
+        dynamics.low_frequency_delay, certificate.get("low_frequency_delay_uncertainty_s"), "s"
+    )
+    spread = number(certificate.get("static_gain_uncertainty"))
+    return [
+        Headline("Low-frequency delay", delay, _k1(delay, "how late slow motion is seen")),
+        _gain_headline(calibration.static_gain, spread),
+        _range_headline(calibration),
+        Headline(
+            "χ², residual over noise",
+            plain(certificate.get("chi_square")),
+            "where the axis moves; 1 if only noise is left",
+        ),
+        Headline(
+            "Noise of one reading",
+            quantity(certificate.get("noise_m"), "m"),
+            f"residual, rms: {quantity(certificate.get('residual_rms_m'), 'm')}",
+        ),
+        _order_headline(calibration),
+    ]
+
+
+def _k1(text: str, detail: str) -> str:
+    return f"{detail}; k = 1" if "±" in text else detail
+
+
+def _gain_headline(gain: float, spread: float | None) -> Headline:
+    value = measured(gain, spread, digits=6)
+    off = measured((gain - 1) / PPM, None if spread is None else spread / PPM)
+    return Headline("Static gain, probe per encoder", value, _k1(value, f"{off} ppm from 1"))
+
+
+def _range_headline(calibration: Calibration) -> Headline:
+    verdict, _ = verdict_of(calibration)
+    name, details = "Known within limits up to", ["rejected: not to be used"]
+    if verdict != REJECTED:
+        nyquist = 0.5 / calibration.sample_period
+        shown = number(calibration.certificate.get("shown_up_to_hz"))
+        name, details = "Valid up to", [f"half the sampling rate is {quantity(nyquist, 'Hz')}"]
+        if shown is not None and calibration.valid_up_to < nyquist:
+            told = calibration.valid_up_to < shown
+            ends = "the band leaves its limits" if told else "the motion tells too little"
+            details.insert(0, f"beyond it {ends}")
+    return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
+
+
+def _order_headline(calibration: Calibration) -> Headline:
+    structure = calibration.certificate.get("structure")
+    known = structure if isinstance(structure, Mapping) else tables.own_structure(calibration)
+    vote = number(calibration.certificate.get("singular_value_order"))
+    detail = "" if vote is None else f"states out of the noise, by singular values: {vote:.0f}"
+    return Headline("Structure", tables.structure_text(known), detail)
+
+
+def sections(certificate: CertificatePage) -> list[Section]:
+    """All parts below the first screen that have anything to show."""
+    calibration = certificate.calibration
+    entries = calibration.certificate
+    warnings = [(text,) for text in tables.texts(entries, "warnings")]
+    identity = tables.identity_table(calibration, certificate.source, certificate.version)
+    every = [
+        Section("Warnings", (), (Table("", (), warnings),)),
+        Section(
+            "Fit to the recording",
+            ("step", "residual"),
+            (tables.residual_table(entries), tables.sample_account(entries)),
+        ),
+        Section("Order", ("order",), (tables.order_table(entries),)),
+        Section(
+            "Dynamics",
+            (),
+            (
+                reading.mode_table(calibration),
+                reading.two_mass_table(entries),
+                tables.limit_table(entries),
+                reading.shape_table(calibration),
+                tables.coefficient_table(calibration),
+            ),
+            "Uncertainties are standard, k = 1. Those of the coefficients are strongly "
+            "correlated; the calibration file has the whole covariance.",
+        ),
+        Section(
+            "Static gain and background",
+            (),
+            (tables.gain_table(calibration), tables.background_table(entries)),
+        ),
+        Section(
+            "Records",
+            (),
+            (
+                identity,
+                mapping_table("Settings calibrated for", calibration.settings),
+                tables.further_table(entries),
+            ),
+        ),
+    ]
+    present = [_present(section, certificate.figures) for section in every]
+    return [section for section in present if section.figures or section.tables]
+
+
+def _present(section: Section, figures: Mapping[str, bytes]) -> Section:
+    return Section(
+        section.title,
+        tuple(name for name in section.figures if name in figures),
+        tuple(table for table in section.tables if table.rows),
+        section.note,
+    )

@@ -1,0 +1,1 @@
+"""What all pages share: style, words for quantities, response figures."""

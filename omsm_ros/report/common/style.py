@@ -1,0 +1,101 @@
+"""One look for all figures: quiet axes, colours that everybody can tell apart, no global state."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from omsm_ros.core.samples.blocks import FloatArray
+
+# Okabe and Ito's blue and vermillion differ in hue and lightness for every kind of sight.
+BEFORE = "#D55E00"
+AFTER = "#0072B2"
+TRUTH = "#1F2933"
+INK = "#1F2933"
+MUTED = "#66727F"
+FAINT = "#D9DEE3"
+MISSING = "#ECEFF2"
+MAP_COLOURS = "viridis"
+
+TEXT_PT = 8.5
+TITLE_PT = 10.0
+FIGURE_DPI = 180
+
+
+def empty(width: float, height: float) -> Figure:
+    """A figure of ``width`` × ``height`` [inch] that no window will ever show."""
+    made = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(made)
+    return made
+
+
+def figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, **gridspec: Any
+) -> tuple[Figure, np.ndarray]:
+    """A figure of ``width`` × ``height`` [inch] and its axes, shape (rows, columns)."""
+    made = empty(width, height)
+    made.set_layout_engine("constrained")
+    axes = made.subplots(rows, columns, squeeze=False, **gridspec)
+    for one in axes.flat:
+        quiet(one)
+    return made, axes
+
+
+def quiet(axes: Axes) -> None:
+    """Thin grey axes, a faint grid behind the data."""
+    axes.tick_params(labelsize=TEXT_PT, colors=MUTED, labelcolor=INK, length=3, width=0.7)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(MUTED)
+        spine.set_linewidth(0.7)
+    axes.grid(True, color=FAINT, linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def label(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
+    """Axis labels (with their units) and a title on the left."""
+    axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
+    axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
+    if title:
+        axes.set_title(title, loc="left", fontsize=TITLE_PT, color=INK, fontweight="bold")
+
+
+def legend_above(axes: Axes) -> None:
+    """A legend on the line of the title, where it covers no data."""
+    entries = len(axes.get_legend_handles_labels()[0])
+    legend(axes, loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=entries, columnspacing=1.4)
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend without a frame around it."""
+    look: dict[str, Any] = {
+        "fontsize": TEXT_PT,
+        "labelcolor": INK,
+        "framealpha": 0.85,
+        "edgecolor": "none",
+        "handlelength": 1.8,
+        "borderpad": 0.2,
+    }
+    axes.legend(**look, **options)
+
+
+Envelope = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelope:
+    """Time, smallest and largest value of each of ``columns`` stretches: no spike is lost."""
+    cuts = np.linspace(0, len(value), min(columns, len(value)), endpoint=False)
+    starts = np.unique(cuts.astype(np.int64))
+    return time[starts], np.minimum.reduceat(value, starts), np.maximum.reduceat(value, starts)
+
+
+def png(made: Figure, dpi: int = FIGURE_DPI) -> bytes:
+    """The figure as a PNG file, the same bytes for the same figure."""
+    buffer = io.BytesIO()
+    made.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,0 +1,180 @@
+"""The numbers of a report as rows of text, with their units."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from omsm_ros.core.dynamics.calibration import Calibration
+
+NOTHING = "–"
+# Nothing smaller than nano: lengths below it are read as 0.31 nm.
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+_THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
+_FIGURE_NAMES = {
+    "peak_to_valley": "peak to valley",
+    "rms": "rms, every point alike",
+    "rms_area_weighted": "rms, every area alike",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """``rows`` of a label and one text a column; ``columns`` may be empty for no heading."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[tuple[str, ...]]
+
+
+def quantity(value: object, unit: str, digits: int = 3) -> str:
+    """A number with an SI prefix, rounded to ``digits``: ``83.1 nm``; a dash for no number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return NOTHING
+    # Rounded first: 999.96 becomes 1.00 k, not 1000.
+    rounded = float(f"{value:.{digits - 1}e}")
+    if rounded == 0:
+        return f"0{_THIN_SPACE}{unit}"
+    magnitude = math.floor(math.log10(abs(rounded)))
+    exponent = min(max(3 * (magnitude // 3), min(_PREFIXES)), max(_PREFIXES))
+    decimals = max(digits - 1 - (magnitude - exponent), 0)
+    text = f"{rounded / 10.0**exponent:.{decimals}f}".replace("-", "−")
+    return f"{text}{_THIN_SPACE}{_PREFIXES[exponent]}{unit}"
+
+
+def count(value: object) -> str:
+    """A number of things, its thousands apart; a dash for no number."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        return NOTHING
+    return f"{value:,}".replace(",", _THIN_SPACE)
+
+
+def part(mapping: Mapping[str, Any], *path: str) -> Any:
+    """What lies at ``path`` in nested mappings, None where it is missing."""
+    found: Any = mapping
+    for key in path:
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found
+
+
+def error_table(summary: Mapping[str, object]) -> Table:
+    """Deviation and dynamic error, before and after the correction."""
+    rows = []
+    for key, name in _FIGURE_NAMES.items():
+        both = [part(summary, "deviation", side, key) for side in ("raw", "corrected")]
+        rows.append((f"deviation from nominal, {name}", *(quantity(v, "m") for v in both)))
+    for key in ("peak_to_valley", "rms"):
+        both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
+        label = f"dynamic error, {_FIGURE_NAMES[key].split(',')[0]}"
+        rows.append((label, *(quantity(v, "m") for v in both)))
+    for key in ("median", "largest"):
+        value = part(summary, "uncertainty", key)
+        rows.append((f"standard uncertainty of a height, {key}", "", quantity(value, "m")))
+    known = [row for row in rows if set(row[1:]) - {NOTHING, ""}]
+    return Table("Errors", ("uncorrected", "corrected"), known)
+
+
+def budget_table(summary: Mapping[str, object]) -> Table:
+    """What the uncertainty of a height is made of, the largest part first."""
+    budget: Mapping[str, Any] = part(summary, "uncertainty_budget") or {}
+    known = {name: value for name, value in budget.items() if value}
+    ordered = sorted(known, key=lambda name: -known[name])
+    rows = [(name.replace("_", " "), quantity(known[name], "m")) for name in ordered]
+    return Table("Uncertainty of a height, k = 1, rms over the scan", (), rows)
+
+
+def motion_table(summary: Mapping[str, object]) -> Table:
+    """Was the scan slow enough, and was H good enough for it?"""
+    prediction: Mapping[str, Any] = part(summary, "prediction") or {}
+    outside = prediction.get("outside_band_fraction")
+    factor = prediction.get("speed_factor")
+    rows = [
+        ("left by the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
+        (
+            "motion beyond the trusted band",
+            NOTHING if outside is None else f"{100 * outside:.2g} %",
+        ),
+        ("could have run faster by", NOTHING if factor is None else f"{factor:.3g} ×"),
+        (
+            "discretisation, peak to valley",
+            quantity(part(summary, "discretisation", "peak_to_valley"), "m"),
+        ),
+    ]
+    return Table("The motion", (), [row for row in rows if row[1] != NOTHING])
+
+
+def sample_table(summary: Mapping[str, object]) -> Table:
+    """Where every sample of every stream went."""
+    streams: Mapping[str, Any] = part(summary, "samples") or {}
+    reasons = dict.fromkeys(r for s in streams.values() for r in part(s, "counted") or {})
+    rows = [("received", *(count(part(s, "received")) for s in streams.values()))]
+    rows.append(("corrected", *(count(part(s, "corrected")) for s in streams.values())))
+    for reason in reasons:
+        cells = (count((part(s, "counted") or {}).get(reason, 0)) for s in streams.values())
+        rows.append((reason.replace("_", " "), *cells))
+    if any(part(s, "pending") for s in streams.values()):
+        rows.append(("still pending", *(count(part(s, "pending")) for s in streams.values())))
+    return Table("Samples", tuple(streams), rows if streams else ())
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """What was identified and how well."""
+    certificate, dynamics = calibration.certificate, calibration.dynamics
+    gain = _with_uncertainty(calibration.static_gain, certificate.get("static_gain_uncertainty"))
+    delay = _seconds(
+        certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay),
+        certificate.get("low_frequency_delay_uncertainty_s"),
+    )
+    rows = [
+        ("verdict", str(certificate.get("verdict", NOTHING))),
+        ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
+        ("static gain, probe per encoder", gain),
+        ("delay of slow motion", delay),
+        ("chi-square per degree of freedom", _plain(certificate.get("chi_square"))),
+        ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
+        ("whiteness of the residual, p", _plain(certificate.get("whiteness_p"))),
+        ("its independence of the motion, p", _plain(certificate.get("independence_p"))),
+        ("edges used", count(certificate.get("edges"))),
+        ("sample period", quantity(calibration.sample_period, "s")),
+    ]
+    for number, mode in enumerate(dynamics.modes(), start=1):
+        text = f"{quantity(mode.frequency, 'Hz')}, damping {_plain(mode.damping)}"
+        rows.append((f"mode {number}", text))
+    rows.append(("identity", calibration.id[:16]))
+    return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
+
+
+def mapping_table(title: str, values: Mapping[str, object]) -> Table:
+    """Any mapping of JSON values, one row a key."""
+    return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
+
+
+def remarks_table(calibration: Calibration) -> Table:
+    """What the identification has to say about its result."""
+    certificate: Mapping[str, Any] = calibration.certificate
+    remarks = [*(certificate.get("reasons") or ()), *(certificate.get("warnings") or ())]
+    return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
+
+
+def _with_uncertainty(value: float, uncertainty: object) -> str:
+    if not isinstance(uncertainty, float) or not 0 < uncertainty < 1:
+        return f"{value:.6f}"
+    decimals = 1 - math.floor(math.log10(uncertainty))
+    return f"{value:.{decimals}f} ± {uncertainty:.{decimals}f}"
+
+
+def _seconds(value: object, uncertainty: object) -> str:
+    text = quantity(value, "s", 4)
+    spread = quantity(uncertainty, "s", 2)
+    return text if spread == NOTHING else f"{text} ± {spread}"
+
+
+def _plain(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, int | float) else NOTHING
+
+
+def _json_text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)

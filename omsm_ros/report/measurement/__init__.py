@@ -1,0 +1,1 @@
+"""The page of a measurement: maps, profiles, and its verdict."""

@@ -1,0 +1,248 @@
+"""Figures of a measured surface: deviation maps, profiles, dynamic error, and the overview.
+
+Every function returns a matplotlib Figure that belongs to the caller; all arguments are
+SI, all labels carry the unit they are drawn in.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.image import AxesImage
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.deviation import Profile
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.report.common import style
+from omsm_ros.report.common.response_figures import draw_gain, draw_phase, frequencies
+from omsm_ros.report.measurement.raster import Raster, rasterise
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+UNITS_M = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "mm": MILLIMETRE_M}
+
+Limits = tuple[float, float]
+
+# A single outlier must not take the colours of all other pixels.
+_SHOWN_SHARE = 0.998
+_BREAK_AT_GAPS = 4
+_LEFT_OF_THE_AXIS = 0.002
+_SMALLEST_SHOWN_M = 1e-3 * NANOMETRE_M
+# Left, bottom, width, height as shares of the figure.
+_MAP_PLACE = (0.125, 0.13, 0.66, 0.765)
+_BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
+
+
+def symmetric_limits(x: FloatArray, y: FloatArray, deviation: FloatArray) -> Limits:
+    """Colour limits ±v [m] that hold all but 0.2 % of the pixels of a map."""
+    return _symmetric(rasterise(x, y, deviation))
+
+
+def _symmetric(raster: Raster) -> Limits:
+    size = np.abs(raster.image[np.isfinite(raster.image)])
+    bound = float(np.quantile(size, _SHOWN_SHARE)) or NANOMETRE_M
+    return -bound, bound
+
+
+def deviation_map(
+    x: FloatArray,
+    y: FloatArray,
+    deviation: FloatArray,
+    *,
+    unit: str,
+    title: str,
+    limits: Limits | None = None,
+    quantity: str = "deviation",
+) -> Figure:
+    """A deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
+
+    unit: "nm", "µm" or "mm"
+    limits: smallest and largest colour [m]; None: see :func:`symmetric_limits`. Give two
+    maps the same limits where they are to be compared.
+    """
+    made = style.empty(4.0, 3.35)
+    _draw_map(made, rasterise(x, y, deviation), unit, title, limits, quantity)
+    return made
+
+
+def _draw_map(
+    part: FigureBase,
+    raster: Raster,
+    unit: str,
+    title: str,
+    limits: Limits | None = None,
+    quantity: str = "deviation",
+) -> None:
+    scale = _unit(unit)
+    # Fixed places, so that apertures side by side are of one size.
+    axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)
+    style.quiet(axes)
+    low, high = limits or _symmetric(raster)
+    left, right, bottom, top = (edge / MILLIMETRE_M for edge in raster.extent)
+    image = axes.imshow(
+        raster.image / scale,
+        origin="lower",
+        extent=(left, right, bottom, top),
+        cmap=style.MAP_COLOURS,
+        vmin=low / scale,
+        vmax=high / scale,
+        interpolation="nearest",
+    )
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5, integer=True))
+    style.label(axes, x="x [mm]", y="y [mm]", title=title)
+    _colour_bar(image, bar, _clipped(raster, low, high), f"{quantity} [{unit}]")
+
+
+def _clipped(raster: Raster, low: float, high: float) -> str:
+    below, above = np.nanmin(raster.image) < low, np.nanmax(raster.image) > high
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((int(below), int(above)), "both")
+
+
+def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
+    bar = place.figure.colorbar(image, cax=place, extend=extend, ticks=MaxNLocator(7))
+    bar.outline.set_visible(False)
+    place.tick_params(labelsize=style.TEXT_PT, colors=style.MUTED, labelcolor=style.INK, length=2)
+    bar.set_label(text, fontsize=style.TEXT_PT, color=style.INK)
+
+
+def profile(
+    raw: Profile, corrected: Profile, *, title: str, position: str, true: Profile | None = None
+) -> Figure:
+    """One profile before and after the correction in µm, and below it what is left in nm.
+
+    position: name of the horizontal axis, drawn in mm
+    true: the true deviation along the same line, where it is known
+    """
+    made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
+    upper, lower = axes[:, 0]
+    _draw_profile(upper, raw, MICROMETRE_M, color=style.BEFORE, label="uncorrected")
+    _draw_profile(upper, corrected, MICROMETRE_M, color=style.AFTER, label="corrected")
+    _draw_profile(lower, corrected, NANOMETRE_M, color=style.AFTER, label="corrected")
+    if true is not None:
+        _draw_profile(
+            lower, true, NANOMETRE_M, color=style.TRUTH, label="true", linestyle=(0, (4, 2))
+        )
+        style.legend_above(lower)
+    style.legend_above(upper)
+    style.label(upper, y="deviation [µm]", title=title)
+    style.label(lower, x=f"{position} [mm]", y="deviation [nm]")
+    made.align_ylabels()
+    return made
+
+
+def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: Any) -> None:
+    gap = np.diff(drawn.position, prepend=drawn.position[0])
+    breaks = np.flatnonzero(gap > _BREAK_AT_GAPS * np.median(gap))
+    position = np.insert(drawn.position, breaks, np.nan)
+    value = np.insert(drawn.value, breaks, np.nan)
+    axes.plot(position / MILLIMETRE_M, value / scale, linewidth=1.1, **look)
+
+
+def dynamic_error(
+    time: FloatArray,
+    before: FloatArray,
+    *,
+    after: FloatArray | None = None,
+    uncertainty: FloatArray | None = None,
+) -> Figure:
+    """Dynamic error over the scan, each (n,) [m]: before in µm, and what is left of it in nm.
+
+    time: [s];  after: true error that is left, known on the twin only
+    uncertainty: standard uncertainty of the height, drawn as ±2u
+    """
+    left = after is not None or uncertainty is not None
+    made, axes = style.figure(6.1, 3.7 if left else 2.2, rows=1 + left, sharex=True)
+    upper, lower = axes[0, 0], axes[-1, 0]
+    _draw_envelope(upper, time, before, MICROMETRE_M, style.BEFORE)
+    style.label(upper, y="before [µm]", title="Dynamic error over the scan")
+    if uncertainty is not None:
+        at, _, largest = style.envelope(time, uncertainty)
+        bound = 2 * largest / NANOMETRE_M
+        lower.fill_between(
+            at, -bound, bound, color=style.AFTER, alpha=0.18, linewidth=0, label="±2u of a height"
+        )
+    if after is not None:
+        _draw_envelope(lower, time, after, NANOMETRE_M, style.AFTER, "true error left")
+    if left:
+        style.legend_above(lower)
+        style.label(lower, y="after [nm]")
+    style.label(lower, x="time [s]", y=lower.get_ylabel())
+    made.align_ylabels()
+    return made
+
+
+def _draw_envelope(
+    axes: Axes, time: FloatArray, value: FloatArray, scale: float, colour: str, text: str = ""
+) -> None:
+    at, low, high = style.envelope(time, value)
+    axes.fill_between(
+        at, low / scale, high / scale, color=colour, linewidth=0.6, label=text or None
+    )
+    axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
+    axes.margins(x=0.01)
+
+
+def error_histogram(
+    before: FloatArray, after: FloatArray, weights: FloatArray, *, left: str = "after"
+) -> Figure:
+    """Share of the area over the size of the error, before and after on one logarithmic axis.
+
+    before, after: errors (n,) [m];  weights: area of each point;  left: name of the second
+    """
+    made, axes = style.figure(6.1, 3.7)
+    ax = axes[0, 0]
+    shown = np.abs(np.concatenate([before, after]))
+    low = max(float(np.quantile(shown, _LEFT_OF_THE_AXIS)), _SMALLEST_SHOWN_M)
+    edges = np.geomspace(low, max(2 * float(shown.max()), 10 * low), 120)
+    for value, colour, text in ((before, style.BEFORE, "before"), (after, style.AFTER, left)):
+        size = np.clip(np.abs(value), edges[0], edges[-1])
+        share = np.histogram(size, edges, weights=weights)[0] / np.sum(weights)
+        ax.stairs(100 * share, edges, fill=True, color=colour, alpha=0.75, label=text)
+    ax.set_xscale("log")
+    ax.xaxis.set_major_formatter(EngFormatter(unit="m"))
+    ax.set_xlim(edges[0], edges[-1])
+    style.label(ax, x="size of the error", y="share of the area [%]", title="Size of the error")
+    style.legend_above(ax)
+    return made
+
+
+def overview_figure(
+    x: FloatArray,
+    y: FloatArray,
+    raw: FloatArray,
+    corrected: FloatArray,
+    identified: Calibration,
+    true: TransferFunction | None = None,
+) -> Figure:
+    """One wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
+
+    raw, corrected: deviations (n,) [m] at x, y [m]
+    """
+    made = style.empty(13.0, 3.75)
+    left, middle, right = made.subfigures(1, 3, squeeze=False)[0]
+    _draw_map(left, rasterise(x, y, raw), "µm", "Uncorrected, in micrometres")
+    _draw_map(middle, rasterise(x, y, corrected), "nm", "Corrected, in nanometres")
+    places = {"left": 0.16, "right": 0.97, "bottom": 0.13, "top": 0.895, "hspace": 0.12}
+    gain, phase = right.subplots(2, 1, sharex=True, gridspec_kw=places)
+    for axes in (gain, phase):
+        style.quiet(axes)
+    at = frequencies(identified)
+    draw_gain(gain, at, identified, true, title="Response of the probe to the carriage")
+    draw_phase(phase, at, identified, true)
+    right.align_ylabels()
+    return made
+
+
+def _unit(name: str) -> float:
+    if name not in UNITS_M:
+        raise ConfigurationError(f"unit {name!r} of a map is unknown, expected one of {[*UNITS_M]}")
+    return UNITS_M[name]

@@ -1,0 +1,175 @@
+"""The HTML page of a measurement: one file, nothing fetched from anywhere."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jinja2
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.report.common import tables
+from omsm_ros.report.common.tables import part, quantity
+from omsm_ros.report.common.verdict import verdict_on_measurement
+
+
+@dataclass(frozen=True, slots=True)
+class Caption:
+    """What stands below a figure; ``wide`` figures fill half of a line, others a third."""
+
+    text: str
+    wide: bool = True
+
+
+MAPS = {
+    "raw_map": Caption("Before the correction: encoder plus probe. Scale in micrometres.", False),
+    "corrected_map_same_scale": Caption(
+        "After it, in the colours of the map before: what is gone was dynamic error.", False
+    ),
+    "corrected_map": Caption("After it, enlarged. Scale in nanometres.", False),
+    "height_map": Caption("Corrected height; no nominal surface was given.", False),
+    "error_map": Caption("What the correction took away at each point.", False),
+}
+PROFILES = {
+    "profile_x": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
+    "profile_y": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
+    "profile_diagonal": Caption("On this line the lag of a part that swings along x shows most."),
+    "profile_radius": Caption("What is the same all around, such as rings left by turning."),
+}
+ERRORS = {
+    "dynamic_error": Caption("Before in micrometres, after in nanometres: different scales."),
+    "error_histogram": Caption("Before and after on one logarithmic axis."),
+}
+DYNAMICS = {
+    "bode": Caption(
+        "Gain, phase, and the error that a sinusoidal motion would leave. Grey: beyond the "
+        "frequency up to which the identified response is trusted."
+    ),
+    "step_response": Caption("One edge of the step test, and what the model leaves of it."),
+}
+CAPTIONS = {**MAPS, **PROFILES, **ERRORS, **DYNAMICS}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything on the page; what is absent leaves no hole.
+
+    title: of the page;  date: as it is to be printed
+    summary: the content of ``summary.json``: optional ``samples`` (an account as its
+        ``as_dict`` gives it), ``dynamic_error_before``, ``dynamic_error_after``,
+        ``deviation`` (``raw``, ``corrected``), ``uncertainty`` (``median``, ``largest``),
+        ``warnings``, ``settings``, ``versions``; lengths in metres
+    calibration: that was applied, if any
+    figures: PNG files by the names in :data:`CAPTIONS`
+
+    Raises ConfigurationError for a figure of another name.
+    """
+
+    title: str
+    date: str
+    summary: Mapping[str, Any]
+    calibration: Calibration | None = None
+    figures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.figures) - set(CAPTIONS))
+        if unknown:
+            raise ConfigurationError(
+                f"figures {unknown!r} have no place on the page, expected of {[*CAPTIONS]}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """One of the numbers at the top."""
+
+    name: str
+    value: str
+    detail: str
+
+
+def render(report: Report) -> str:
+    """The page as HTML; all text from outside is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("omsm_ros.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        report=report,
+        verdict=verdict_on_measurement(report.summary, report.calibration),
+        headlines=headlines(report.summary),
+        sections=_sections(report),
+        records=_records(report),
+        picture=lambda name: b64encode(report.figures[name]).decode(),
+        caption=CAPTIONS.__getitem__,
+    )
+
+
+def headlines(summary: Mapping[str, Any]) -> list[Headline]:
+    """The numbers that a reader looks for first, those that are known."""
+    found = []
+    form = part(summary, "deviation", "corrected")
+    if form:
+        value = quantity(form["rms_area_weighted"], "m")
+        detail = f"peak to valley {quantity(form['peak_to_valley'], 'm')}"
+        found.append(Headline("Deviation from nominal, rms by area", value, detail))
+    before = part(summary, "dynamic_error_before")
+    if before:
+        found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))
+    median = part(summary, "uncertainty", "median")
+    if median is not None:
+        text = "of a single height, median, k = 2"
+        found.append(Headline("Expanded uncertainty", quantity(2 * median, "m"), text))
+    stream = part(summary, "samples", "distance")
+    if stream:
+        text = f"of {tables.count(stream['received'])} samples received"
+        found.append(Headline("Surface points", tables.count(stream["corrected"]), text))
+    return found
+
+
+def _dynamic_headline(before: Mapping[str, Any], after: Mapping[str, Any] | None) -> Headline:
+    value = quantity(before["rms"], "m")
+    detail = f"peak to valley {quantity(before['peak_to_valley'], 'm')}"
+    if not after:
+        return Headline("Dynamic error removed, rms", value, detail)
+    return Headline(
+        "Dynamic error, rms",
+        f"{value} → {quantity(after['rms'], 'm')}",
+        f"{detail} → {quantity(after['peak_to_valley'], 'm')}",
+    )
+
+
+def _sections(report: Report) -> list[tuple[str, list[str]]]:
+    groups = {
+        "Surface": MAPS,
+        "Profiles": PROFILES,
+        "Dynamic error": ERRORS,
+        "Dynamics of the probe": DYNAMICS,
+    }
+    present = {title: [n for n in names if n in report.figures] for title, names in groups.items()}
+    return [(title, names) for title, names in present.items() if names]
+
+
+def _records(report: Report) -> list[tables.Table]:
+    summary = report.summary
+    found = [
+        tables.error_table(summary),
+        tables.budget_table(summary),
+        tables.motion_table(summary),
+        tables.sample_table(summary),
+    ]
+    if report.calibration is not None:
+        found.append(tables.calibration_table(report.calibration))
+        found.append(tables.remarks_table(report.calibration))
+        found.append(tables.mapping_table("Settings calibrated for", report.calibration.settings))
+    settings = part(summary, "settings") or {}
+    if report.calibration is None or settings != dict(report.calibration.settings):
+        found.append(tables.mapping_table("Settings", settings))
+    found.append(tables.mapping_table("Versions", part(summary, "versions") or {}))
+    return [table for table in found if table.rows]

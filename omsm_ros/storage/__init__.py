@@ -1,0 +1,1 @@
+"""Bags and files, and the one mapping between messages and records."""

@@ -1,0 +1,268 @@
+"""Bags: recordings of the contract's topics, read and written without ROS.
+
+Reads rosbag2 folders (sqlite3 and MCAP) and bare ``.mcap`` files; writes one bare ``.mcap``
+file, which ``ros2 bag`` and Foxglove open as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
+from omsm_ros.errors import BagError, DataError
+from omsm_ros.storage import conversions
+from omsm_ros.storage.conversions import Messages
+
+AXES_TOPIC = "/omsm/axes"
+DISTANCE_TOPIC = "/omsm/confocal"
+REFERENCE_TOPIC = "/omsm/reference"
+ACCELERATION_TOPIC = "/omsm/acceleration"
+CALIBRATION_TOPIC = "/omsm/calibration"
+POINTS_TOPIC = "/omsm/points"
+
+TOPIC_TYPES = {
+    AXES_TOPIC: "omsm_msgs/msg/AxisBlock",
+    DISTANCE_TOPIC: "omsm_msgs/msg/DistanceBlock",
+    REFERENCE_TOPIC: "omsm_msgs/msg/DistanceBlock",
+    ACCELERATION_TOPIC: "omsm_msgs/msg/AccelerationBlock",
+    CALIBRATION_TOPIC: "omsm_msgs/msg/Calibration",
+    POINTS_TOPIC: "sensor_msgs/msg/PointCloud2",
+}
+
+_TO_RECORD: dict[str, Callable[[Any], Any]] = {
+    AXES_TOPIC: conversions.axis_block,
+    DISTANCE_TOPIC: conversions.distance_block,
+    REFERENCE_TOPIC: conversions.distance_block,
+    ACCELERATION_TOPIC: conversions.acceleration_block,
+    CALIBRATION_TOPIC: conversions.calibration,
+    POINTS_TOPIC: conversions.cloud_array,
+}
+
+# What rosbags raises on bytes that are not what they claim to be.
+_MALFORMED = (
+    ReaderError,
+    SerdeError,
+    ValueError,
+    LookupError,
+    AssertionError,
+    struct.error,
+    OSError,
+    EOFError,
+    OverflowError,
+    MemoryError,  # a length field that claims more than there is
+)
+
+Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """Types of ROS 2 Jazzy and of omsm_msgs, from the same ``.msg`` texts ROS builds from."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for text in sorted(_message_folder().glob("*.msg")):
+        types.update(get_types_from_msg(text.read_text(), f"omsm_msgs/msg/{text.stem}"))
+    store.register(types)
+    return store
+
+
+def _message_folder() -> Path:
+    package = Path(__file__).resolve().parents[1]
+    # Installed beside the code, or in a source checkout next to the package.
+    installed = package / "interfaces" / "msg"
+    return installed if installed.is_dir() else package.parent / "msg_defs" / "msg"
+
+
+@lru_cache(maxsize=1)
+def bag_messages() -> Messages:
+    """Message classes for writing bags without ROS."""
+    names = {
+        "AxisBlock": "omsm_msgs/msg/AxisBlock",
+        "DistanceBlock": "omsm_msgs/msg/DistanceBlock",
+        "Calibration": "omsm_msgs/msg/Calibration",
+        "Header": "std_msgs/msg/Header",
+        "Time": "builtin_interfaces/msg/Time",
+        "PointCloud2": "sensor_msgs/msg/PointCloud2",
+        "PointField": "sensor_msgs/msg/PointField",
+    }
+    types = typestore().types
+    return Messages({short: types[name] for short, name in names.items()}, _bag_sequence)
+
+
+def _bag_sequence(values: ArrayLike, dtype: DTypeLike) -> Any:
+    return np.ascontiguousarray(values, dtype)
+
+
+# ------------------------------------------------------------------------------ reading
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """What a bag holds on one topic."""
+
+    topic: str
+    type: str
+    messages: int
+
+
+class BagReader:
+    """A bag opened for reading; use it as a context manager.
+
+    Raises BagError if the path is missing, no bag, or cut short.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> BagReader:
+        if not self.path.exists():
+            raise BagError(f"no bag at {str(self.path)!r}; check the path")
+        try:
+            self._reader = self._stack.enter_context(Reader(self.path))
+        except _MALFORMED as err:
+            raise BagError(
+                f"{str(self.path)!r} is not a readable bag ({err}); expected a rosbag2 folder or "
+                "an .mcap file that was closed properly"
+            ) from err
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def topics(self) -> list[TopicSummary]:
+        """What is in the bag, by topic name."""
+        found = [TopicSummary(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
+        return sorted(found, key=lambda summary: summary.topic)
+
+    def count(self, topics: Sequence[str]) -> int:
+        """Number of messages on ``topics``."""
+        return sum(t.messages for t in self.topics() if t.topic in topics)
+
+    def records(self, *topics: str) -> Iterator[Item]:
+        """Yield ``(topic, record)`` in the order of recording.
+
+        Raises BagError if one of ``topics`` is absent, of another type, or malformed.
+        """
+        connections = [self._connection(topic) for topic in topics]
+        try:
+            for connection, _, raw in self._reader.messages(connections):
+                message = typestore().deserialize_cdr(raw, connection.msgtype)
+                yield connection.topic, _TO_RECORD[connection.topic](message)
+        except DataError as err:
+            raise BagError(f"{str(self.path)!r} holds a malformed message: {err}") from err
+        except BagError:
+            raise
+        except _MALFORMED as err:
+            raise BagError(
+                f"{str(self.path)!r} is damaged: {type(err).__name__}: {err}; record it again or "
+                "recover what is left of it with the mcap tool"
+            ) from err
+
+    def _connection(self, topic: str) -> Connection:
+        held = ", ".join(t.topic for t in self.topics()) or "nothing"
+        for connection in self._reader.connections:
+            if connection.topic == topic:
+                break
+        else:
+            raise BagError(
+                f"{str(self.path)!r} has no topic {topic!r}; it holds {held}. "
+                "Record the raw topics of the cell"
+            )
+        if connection.msgtype != TOPIC_TYPES[topic]:
+            raise BagError(
+                f"{topic!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
+                f"{TOPIC_TYPES[topic]!r}"
+            )
+        digest = typestore().hash_rihs01(connection.msgtype)
+        if connection.digest and connection.digest != digest:
+            raise BagError(
+                f"{topic!r} in {str(self.path)!r} was recorded with another definition of "
+                f"{connection.msgtype!r} ({connection.digest!r}, expected {digest!r})"
+            )
+        return connection
+
+
+# ------------------------------------------------------------------------------ writing
+
+
+class BagWriter:
+    """Writes one ``.mcap`` file; it appears under its name only when it is complete.
+
+    Use it as a context manager; leaving it by an exception removes what was written.
+    """
+
+    def __init__(self, path: Path | str, topics: Sequence[str]) -> None:
+        self.path = Path(path)
+        self._topics = topics
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> BagWriter:
+        folder = self.path.parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # In the same folder, so that the last step is a rename and cannot be half done.
+            self._scratch = Path(tempfile.mkdtemp(prefix=f".{self.path.name}-", dir=folder))
+        except OSError as err:
+            raise BagError(f"cannot write {str(self.path)!r}: {err.strerror or err}") from err
+        self._writer = Writer(self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        for topic in self._topics:
+            self._connections[topic] = self._writer.add_connection(
+                topic, TOPIC_TYPES[topic], typestore=typestore()
+            )
+        return self
+
+    def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
+        """Append one message as it came over the wire, received at ``stamp_ns``."""
+        self._writer.write(self._connections[topic], stamp_ns, cdr)
+
+    def write(self, topic: str, stamp_ns: int, message: object) -> None:
+        """Append one message made of :func:`bag_messages`."""
+        self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
+
+    def write_axes(self, block: AxisBlock) -> None:
+        """Append a block of the axes at its own stamp."""
+        message = conversions.axis_message(bag_messages(), block)
+        self.write(AXES_TOPIC, block.stamp_ns, message)
+
+    def write_distance(self, block: DistanceBlock) -> None:
+        """Append a block of the probe at its own stamp."""
+        message = conversions.distance_message(bag_messages(), block)
+        self.write(DISTANCE_TOPIC, block.stamp_ns, message)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.close()
+            if kind is None:
+                os.replace(self._scratch / "bag" / "bag.mcap", self.path)
+        finally:
+            shutil.rmtree(self._scratch, ignore_errors=True)

@@ -1,0 +1,228 @@
+"""The one mapping between messages on the wire and records of the core.
+
+The same field names hold for messages of rclpy and for those that ``rosbags``
+deserialises without ROS, so one function reads both. To *make* a message one needs its
+class: :class:`Messages` carries the classes of one world, and how that world wants its arrays.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
+from omsm_ros.errors import CalibrationError
+from omsm_ros.units import NANOSECONDS_PER_S
+
+MAX_JSON_CHARACTERS = 1_000_000
+
+_AXES = ("x", "y", "z", "b", "c")
+_POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Message classes by their short name ("AxisBlock", "Header", …) and an array maker."""
+
+    classes: Mapping[str, Callable[..., Any]]
+    sequence: Callable[[ArrayLike, DTypeLike], Any]
+
+    def make(self, name: str, /, **fields: object) -> Any:
+        """A new message ``name`` with all ``fields``."""
+        return self.classes[name](**fields)
+
+
+def ros_messages() -> Messages:
+    """The message classes of the sourced ROS workspace."""
+    from builtin_interfaces.msg import Time
+    from omsm_msgs import msg
+    from sensor_msgs.msg import PointCloud2, PointField
+    from std_msgs.msg import Header
+
+    ours = {name: getattr(msg, name) for name in ("AxisBlock", "DistanceBlock", "Calibration")}
+    others = {c.__name__: c for c in (Time, Header, PointCloud2, PointField)}
+    return Messages({**ours, **others}, _ros_sequence)
+
+
+def _ros_sequence(values: ArrayLike, dtype: DTypeLike) -> array.array[Any]:
+    contiguous = np.ascontiguousarray(values, dtype)
+    result: array.array[Any] = array.array(contiguous.dtype.char)
+    # Filling from the buffer is thousands of times faster than from an iterable.
+    result.frombytes(contiguous.view(np.uint8).data)
+    return result
+
+
+# ------------------------------------------------------------------ messages → records
+
+
+def stamp_of(message: Any) -> int:
+    """Header stamp of a message [ns]."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NANOSECONDS_PER_S + int(stamp.nanosec)
+
+
+def _block_fields(message: Any) -> dict[str, Any]:
+    return {
+        "stamp_ns": stamp_of(message),
+        "first_sample": int(message.first_sample),
+        "sample_period": float(message.sample_period),
+    }
+
+
+def axis_block(message: Any) -> AxisBlock:
+    """Record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
+    channels = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
+    return AxisBlock(**_block_fields(message), **channels)
+
+
+def distance_block(message: Any) -> DistanceBlock:
+    """Record of an ``omsm_msgs/DistanceBlock``; DataError if its channels do not fit."""
+    return DistanceBlock(
+        **_block_fields(message),
+        distance=np.asarray(message.distance, np.float64),
+        intensity=np.asarray(message.intensity, np.float32),
+        status=np.asarray(message.status, np.uint8),
+    )
+
+
+def acceleration_block(message: Any) -> AccelerationBlock:
+    """Record of an ``omsm_msgs/AccelerationBlock``; DataError if its channels do not fit."""
+    channels = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
+    return AccelerationBlock(**_block_fields(message), **channels)
+
+
+def calibration(message: Any) -> Calibration:
+    """Record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered."""
+    record = Calibration.from_content(
+        {
+            "numerator": message.numerator,
+            "denominator": message.denominator,
+            "delay": message.delay,
+            "static_gain": message.static_gain,
+            "sample_period": message.sample_period,
+            "valid_up_to": message.valid_up_to,
+            "covariance": message.covariance,
+            "settings": _json_object("settings", message.settings),
+            "certificate": _json_object("certificate", message.certificate),
+        }
+    )
+    if message.id != record.id:
+        raise CalibrationError(
+            f"calibration message carries id {message.id!r} but its content hashes to "
+            f"{record.id!r}: it was altered on the way; identify or load it again"
+        )
+    return record
+
+
+def _json_object(name: str, text: str) -> dict[str, object]:
+    if len(text) > MAX_JSON_CHARACTERS:
+        raise CalibrationError(
+            f"{name} of {len(text)} characters, at most {MAX_JSON_CHARACTERS} are accepted"
+        )
+    try:
+        value = json.loads(text) if text else {}
+    except (ValueError, RecursionError) as err:
+        raise CalibrationError(f"{name} is not JSON: {err}") from err
+    if not isinstance(value, dict):
+        raise CalibrationError(f"{name} is {type(value).__name__}, expected a JSON object")
+    return value
+
+
+def cloud_array(message: Any) -> NDArray[np.void]:
+    """Points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``."""
+    if message.point_step != POINT_DTYPE.itemsize or message.is_bigendian:
+        raise CalibrationError(
+            f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}"
+        )
+    return np.frombuffer(memoryview(message.data), POINT_DTYPE)
+
+
+# ------------------------------------------------------------------ records → messages
+
+
+def header(messages: Messages, stamp_ns: int, frame: str) -> Any:
+    """A std_msgs/Header."""
+    sec, nanosec = divmod(stamp_ns, NANOSECONDS_PER_S)
+    return messages.make(
+        "Header", stamp=messages.make("Time", sec=sec, nanosec=nanosec), frame_id=frame
+    )
+
+
+def _block_message(messages: Messages, block: Block, frame: str) -> dict[str, Any]:
+    return {
+        "header": header(messages, block.stamp_ns, frame),
+        "first_sample": block.first_sample,
+        "sample_period": block.sample_period,
+    }
+
+
+def axis_message(messages: Messages, block: AxisBlock, frame: str = "machine") -> Any:
+    """``omsm_msgs/AxisBlock`` of a record."""
+    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in _AXES}
+    return messages.make("AxisBlock", **_block_message(messages, block, frame), **channels)
+
+
+def distance_message(messages: Messages, block: DistanceBlock, frame: str = "probe") -> Any:
+    """``omsm_msgs/DistanceBlock`` of a record."""
+    return messages.make(
+        "DistanceBlock",
+        **_block_message(messages, block, frame),
+        distance=messages.sequence(block.distance, np.float64),
+        intensity=messages.sequence(block.intensity, np.float32),
+        status=messages.sequence(block.status, np.uint8),
+    )
+
+
+def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
+    """``omsm_msgs/Calibration`` of a record."""
+    return messages.make(
+        "Calibration",
+        header=header(messages, stamp_ns, "machine"),
+        id=record.id,
+        numerator=messages.sequence(record.dynamics.numerator, np.float64),
+        denominator=messages.sequence(record.dynamics.denominator, np.float64),
+        delay=record.dynamics.delay,
+        static_gain=record.static_gain,
+        sample_period=record.sample_period,
+        valid_up_to=record.valid_up_to,
+        covariance=messages.sequence(record.covariance.ravel(), np.float64),
+        settings=json.dumps(dict(record.settings), sort_keys=True),
+        certificate=json.dumps(dict(record.certificate), sort_keys=True),
+    )
+
+
+def cloud_message(
+    messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
+) -> Any:
+    """``sensor_msgs/PointCloud2`` of packed points (n,) of ``POINT_DTYPE``."""
+    offsets = POINT_DTYPE.fields or {}
+    fields = [
+        messages.make(
+            "PointField",
+            name=name,
+            offset=offsets[name][1],
+            datatype=_POINT_FIELD_TYPES[kind],
+            count=1,
+        )
+        for name, kind in CLOUD_FIELDS
+    ]
+    return messages.make(
+        "PointCloud2",
+        header=header(messages, stamp_ns, frame),
+        height=1,
+        width=len(packed),
+        fields=fields,
+        is_bigendian=False,
+        point_step=POINT_DTYPE.itemsize,
+        row_step=POINT_DTYPE.itemsize * len(packed),
+        data=messages.sequence(packed.view(np.uint8), np.uint8),
+        is_dense=True,
+    )

@@ -1,0 +1,139 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+from omsm_ros import cli
+from omsm_ros.storage import bags, calibration_file, cloud_file
+from omsm_ros.twin.cell import blocks_of
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, step_test, small_scan_blocks, true_calibration):
+    """Two bags, a calibration and a nominal surface."""
+    folder = tmp_path_factory.mktemp("cell")
+    for name, blocks in (("steps", blocks_of(step_test)), ("scan", small_scan_blocks)):
+        with bags.BagWriter(folder / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+            for axes, distance in blocks:
+                bag.write_axes(axes)
+                bag.write_distance(distance)
+    calibration_file.save_calibration(folder / "cal.json", true_calibration)
+    (folder / "mirror.yaml").write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    with bags.BagWriter(folder / "empty.mcap", (bags.REFERENCE_TOPIC,)):
+        pass
+    (folder / "notes.txt").write_text("the mirror looks fine\n")
+    return folder
+
+
+def run(capsys, *arguments):
+    status = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_identify_writes_a_calibration(capsys, folder, tmp_path):
+    out = tmp_path / "new.json"
+    status, text, err = run(
+        capsys, "identify", folder / "steps.mcap", "--out", out, "--json", "--order", 2
+    )
+    assert (status, err) == (0, "")
+    facts = json.loads(text)
+    calibration = calibration_file.load_calibration(out)
+    assert facts["id"] == calibration.id
+    assert facts["low_frequency_delay"] == pytest.approx(0.3397e-3, abs=5e-6)
+    assert facts["static_gain"] == pytest.approx(0.99213, abs=5e-5)
+
+
+def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
+    status, text, _ = run(
+        capsys, "correct", folder / "scan.mcap", "--calibration", folder / "cal.json",
+        "--out", tmp_path, "--nominal", folder / "mirror.yaml", "--json",
+    )  # fmt: skip
+    assert status == 0
+    summary = json.loads(text)
+    assert summary == json.loads((tmp_path / "summary.json").read_text())
+    for account in summary["samples"].values():
+        assert account["received"] == 40_000
+        assert account["corrected"] + sum(account["counted"].values()) == 40_000
+    cloud = cloud_file.CloudFile(tmp_path / "cloud.ply").read()
+    assert len(cloud) == summary["samples"]["distance"]["corrected"]
+    # The figure error of the twin's mirror is a few nanometres here, the probe's noise 10 nm.
+    assert summary["deviation"]["corrected"]["rms"] < 15e-9
+    assert "<html" in (tmp_path / "report.html").read_text()
+    assert {p.name for p in tmp_path.iterdir()} == {"cloud.ply", "summary.json", "report.html"}
+
+
+def test_inspect_counts_what_is_there(capsys, folder):
+    status, text, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
+    assert status == 0
+    topics = {t["topic"]: t for t in json.loads(text)["topics"]}
+    axes = topics[bags.AXES_TOPIC]
+    assert (axes["samples"], axes["gaps"], axes["restarts"]) == (40_000, 0, 0)
+    assert axes["sample_period"] == 1e-3
+
+
+@pytest.mark.parametrize("command", ["identify", "correct", "inspect"])
+def test_every_command_speaks_to_people_too(capsys, folder, tmp_path, command):
+    arguments = {
+        "identify": [folder / "steps.mcap", "--out", tmp_path / "c.json", "--order", 2],
+        "correct": [folder / "scan.mcap", "--calibration", folder / "cal.json", "--out", tmp_path],
+        "inspect": [folder / "scan.mcap"],
+    }
+    status, text, _ = run(capsys, command, *arguments[command])
+    assert status == 0
+    assert len(text.splitlines()) >= 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["identify", "/no/such/bag", "--out", "{tmp}/c.json"], "/no/such/bag"),
+        (["identify", "{folder}/empty.mcap", "--out", "{tmp}/c.json"], "/omsm/axes"),
+        (["identify", "{folder}/steps.mcap", "--out", "{tmp}/c.json", "--order", "-3"], "-3"),
+        (["inspect", "{folder}/notes.txt"], "notes.txt"),
+        (["correct", "{folder}/scan.mcap", "--calibration", "{folder}/notes.txt", "--out", "{tmp}"],
+         "notes.txt"),
+        (["correct", "/no/such/bag", "--calibration", "{folder}/cal.json", "--out", "{tmp}"],
+         "/no/such/bag"),
+        (["correct", "{folder}/scan.mcap", "--calibration", "{folder}/cal.json", "--out", "{tmp}",
+          "--nominal", "{folder}/notes.txt"], "notes.txt"),
+        (["correct", "{folder}/scan.mcap", "--calibration", "{folder}/cal.json",
+          "--out", "{folder}/notes.txt"], "notes.txt"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_2(capsys, folder, tmp_path, arguments, named):
+    given = [a.format(folder=folder, tmp=tmp_path) for a in arguments]
+    status, out, err = run(capsys, *given, *(["--json"] if "--json" not in given else []))
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert named in err
+    assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_commands_work_without_ros(folder):
+    """A Python that cannot import any ROS package runs the offline commands all the same."""
+    block = (
+        "import sys\n"
+        "class NoRos:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('rclpy', 'omsm_msgs', 'std_msgs', 'sensor_msgs'):\n"
+        "            raise ImportError(name)\n"
+        "sys.meta_path.insert(0, NoRos())\n"
+        "from omsm_ros.cli import main\n"
+        f"sys.exit(main(['inspect', {str(folder / 'scan.mcap')!r}, '--json']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, timeout=50)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["topics"]
+
+
+def test_every_word_is_where_main_looks_for_it():
+    import importlib
+
+    from omsm_ros.cli.main import WORDS
+
+    for module, words in WORDS.items():
+        assert tuple(c.name for c in importlib.import_module(module).COMMANDS) == words

@@ -1,0 +1,95 @@
+"""Stale and foreign calibrations."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.applicability import admit, objections
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.errors import CalibrationError
+
+SETTINGS = {"exposure_s": 0.5e-3, "averaging": 1, "machine": "Nanoform 250", "triggered": True}
+
+
+def calibration(**certificate: object) -> Calibration:
+    return Calibration(
+        dynamics=TransferFunction(np.ones(1), np.array([1.0, 1e-4])),
+        static_gain=1.0,
+        sample_period=1e-3,
+        valid_up_to=100.0,
+        covariance=np.zeros((3, 3)),
+        settings=SETTINGS,
+        certificate=certificate,
+    )
+
+
+def test_the_same_settings_raise_no_objection() -> None:
+    known = calibration(verdict="accepted up to 80 Hz", polarity=1)
+    assert objections(known, sample_period=1e-3, settings=SETTINGS, polarity=1) == ()
+
+
+def test_what_is_not_asked_is_not_objected_to() -> None:
+    assert objections(calibration()) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("exposure_s", 1e-3, "exposure_s is 0.001, calibrated with 0.0005"),
+        ("averaging", 4, "averaging is 4, calibrated with 1"),
+        ("machine", "other", "machine is 'other', calibrated with 'Nanoform 250'"),
+        ("triggered", False, "triggered is False, calibrated with True"),
+        ("triggered", 1.5, "triggered is 1.5, calibrated with True"),
+    ],
+)
+def test_a_setting_that_differs_is_told_with_both_values(
+    name: str, value: object, text: str
+) -> None:
+    assert objections(calibration(), settings=SETTINGS | {name: value}) == (text,)
+
+
+def test_a_setting_that_is_no_longer_known_is_told() -> None:
+    now = {k: v for k, v in SETTINGS.items() if k != "averaging"}
+    assert objections(calibration(), settings=now) == ("averaging is not known, calibrated with 1",)
+
+
+def test_numbers_are_compared_as_numbers() -> None:
+    assert objections(calibration(), settings=SETTINGS | {"averaging": 1.0}) == ()
+    assert objections(calibration(), settings=SETTINGS | {"exposure_s": 0.5000000001e-3}) == ()
+
+
+def test_another_rate_and_an_old_age_are_told() -> None:
+    found = objections(calibration(), sample_period=0.5e-3, age=7200.0, max_age=3600.0)
+    assert found[0] == "sample period is 0.0005 s, calibrated at 0.001 s"
+    assert found[1] == "it was made 7200 s ago, more than the 3600 s allowed"
+
+
+def test_a_failed_certificate_tells_its_reasons() -> None:
+    failed = calibration(verdict="rejected", reasons=["too noisy", "too few edges"])
+    (text,) = objections(failed)
+    assert text == "its certificate says 'rejected' (too noisy; too few edges)"
+
+
+def test_a_probe_turned_round_since_is_told() -> None:
+    assert objections(calibration(polarity=1), polarity=-1) == (
+        "polarity is -1, calibrated with 1",
+    )
+
+
+def test_objections_refuse_unless_overridden_and_are_recorded() -> None:
+    known = calibration(verdict="rejected")
+    reasons = objections(known, sample_period=0.5e-3)
+    with pytest.raises(CalibrationError, match=r"rejected.*0\.0005 s.*override") as refusal:
+        admit(known, reasons, override=False)
+    assert known.id[:12] in str(refusal.value)
+    recorded = json.loads(json.dumps(admit(known, reasons, override=True)))
+    assert recorded == {"calibration": known.id, "objections": list(reasons), "overridden": True}
+
+
+def test_without_objections_nothing_is_overridden() -> None:
+    known = calibration()
+    assert admit(known, (), override=True)["overridden"] is False

@@ -1,0 +1,96 @@
+"""The audit of the discretisation against closed forms and the twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.discretisation_error import (
+    audit,
+    checked_motion,
+    choose_order,
+    discretisation_error,
+    velocity_spectrum,
+)
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import DataError
+from omsm_ros.twin.plant import PAPER_EQ_12
+
+PAPER = PAPER_EQ_12.normalised()
+TIME = np.arange(20_000) * 1e-3
+SPIRAL = Spiral(PAPER_MIRROR, start_radius=12.7e-3, feed_per_turn=0.5e-3, spindle_speed=30.0)
+
+
+def spiral_motion() -> np.ndarray:
+    return SPIRAL.positions(np.arange(50_000) * 1e-3).z
+
+
+def test_half_the_spectrums_power_is_the_mean_square_velocity() -> None:
+    z = 1e-3 * np.sin(2 * np.pi * 3.0 * TIME) + 2e-4 * np.cos(2 * np.pi * 7.0 * TIME)
+    _, velocity = velocity_spectrum(z, 1e-3)
+    expected = 0.5 * ((2 * np.pi * 3e-3) ** 2 + (2 * np.pi * 7 * 2e-4) ** 2)
+    assert np.sum(abs(velocity) ** 2) / 2 == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_error_on_a_sine_is_that_of_the_response(order: int) -> None:
+    frequency, amplitude = np.array([12.0]), 1e-3
+    digital = discretise(PAPER, 1e-3, order)
+    z = amplitude * np.sin(2 * np.pi * frequency[0] * TIME)
+    rms, peak_to_valley = discretisation_error(PAPER, digital, z, up_to=50.0)
+    magnitude = amplitude * abs(digital.response(frequency) - PAPER.response(frequency))[0]
+    assert rms == pytest.approx(magnitude / np.sqrt(2), rel=0.01)
+    assert peak_to_valley == pytest.approx(2 * magnitude, rel=0.02)
+
+
+def test_error_over_time_is_that_of_the_filter() -> None:
+    # A second method: the first-order filter against one of order 7, sample by sample.
+    z = spiral_motion()
+    coarse, fine = discretise(PAPER, 1e-3, 1), discretise(PAPER, 1e-3, 7)
+    difference = signal.sosfilt(coarse.sections, z) - signal.sosfilt(fine.sections, z)
+    rms, peak_to_valley = discretisation_error(PAPER, coarse, z, up_to=100.0)
+    assert rms == pytest.approx(np.std(difference[5000:-5000]), rel=0.2)
+    assert peak_to_valley == pytest.approx(np.ptp(difference[5000:-5000]), rel=0.05)
+
+
+def test_the_papers_path_costs_no_tenth_of_a_nanometre() -> None:
+    judged = {a.method: a for a in audit(PAPER, 1e-3, spiral_motion(), up_to=100.0)}
+    assert judged["polynomial 3"].peak_to_valley < 1e-12
+    assert judged["bilinear"].peak_to_valley < 0.1e-9
+    assert judged["polynomial 1"].peak_to_valley > 1e-9
+
+
+def test_the_least_error_comes_first() -> None:
+    judged = audit(PAPER, 1e-3, spiral_motion(), up_to=100.0)
+    assert [a.rms for a in judged] == sorted(a.rms for a in judged)
+
+
+def test_a_delay_cannot_be_transformed_bilinearly() -> None:
+    late = TransferFunction(PAPER.numerator, PAPER.denominator, 0.3e-3)
+    judged = audit(late, 1e-3, spiral_motion(), up_to=100.0)
+    assert all(a.order is not None for a in judged)
+
+
+def test_noise_pays_for_a_low_order_and_fast_motion_for_a_high_one() -> None:
+    fast = 1e-3 * np.sin(2 * np.pi * 40.0 * TIME)
+    quiet = choose_order(PAPER, 1e-3, fast, up_to=100.0)
+    noisy = choose_order(PAPER, 1e-3, 1e-6 * fast, up_to=100.0, encoder_noise=10e-9)
+    assert quiet.order == 7
+    assert noisy.order == 1
+
+
+@pytest.mark.parametrize(
+    ("motion", "text"),
+    [
+        (np.zeros(10), r"shape \(10,\)"),
+        (np.zeros((100, 2)), r"shape \(100, 2\)"),
+        (np.r_[np.zeros(99), np.nan], "1 values that are not finite"),
+    ],
+)
+def test_a_motion_that_cannot_be_judged_is_named(motion: np.ndarray, text: str) -> None:
+    with pytest.raises(DataError, match=text):
+        checked_motion(motion)

@@ -1,0 +1,106 @@
+"""What is decided before any model exists."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.fitting.periodic_input import close_period
+from omsm_ros.core.fitting.preparation import content_frequency, prepare
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import IdentificationError
+
+TIME = np.arange(round(StepTest().duration / 1e-3)) * 1e-3
+STEPS = StepTest().positions(TIME).z
+
+
+def record_of(extra=0.0, gain=1.0, lost=None, seed=1):
+    rng = np.random.default_rng(seed)
+    distance = 3e-6 - gain * STEPS + rng.normal(0, 1e-8, len(STEPS)) + extra
+    if lost is not None:
+        distance[lost] = np.nan
+    return MotionRecord.from_arrays(1e-3, STEPS + rng.normal(0, 4e-10, len(STEPS)), distance)
+
+
+def test_single_spikes_are_taken_out_and_counted():
+    spikes = np.zeros(len(STEPS))
+    spikes[[700, 1300, 5222]] = [1e-6, -5e-7, 2e-6]
+    prepared = prepare(record_of(spikes), "encoder")
+    assert prepared.spikes == 3
+    assert not np.any(prepared.problem.used[[700, 1300, 5222]])
+
+
+def test_edges_are_no_spikes():
+    assert prepare(record_of(), "encoder").spikes == 0
+
+
+def test_lost_samples_are_not_used():
+    prepared = prepare(record_of(lost=slice(2000, 2100)), "encoder")
+    assert not np.any(prepared.problem.used[2000:2100])
+    assert np.sum(prepared.problem.used) > 10_000
+
+
+def test_after_a_gap_of_the_encoder_the_response_settles_first():
+    z = STEPS.copy()
+    z[1000:1030] = np.nan  # the second edge
+    prepared = prepare(MotionRecord.from_arrays(1e-3, z, -STEPS + 1e-9 * np.sin(TIME)), "encoder")
+    assert not np.any(prepared.problem.used[1000:1080])
+    assert prepared.problem.used[1090]
+    assert len(prepared.steps.edges) == 19
+
+
+def test_a_bent_drift_gets_its_columns_and_a_straight_one_does_not():
+    straight = prepare(record_of(1e-7 * TIME / TIME[-1]), "encoder")
+    bent = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")
+    assert straight.problem.background.shape[1] == 2
+    assert bent.problem.background.shape[1] == 4
+
+
+def test_backlash_gets_its_column():
+    direction = np.where(TIME < 5.5, 20e-9, -20e-9)
+    prepared = prepare(record_of(direction), "encoder")
+    assert prepared.backlash_column is not None
+    assert prepare(record_of(), "encoder").backlash_column is None
+
+
+def test_the_probes_gain_must_be_plausible():
+    prepare(record_of(gain=-0.9), "encoder")
+    with pytest.raises(IdentificationError, match="expected about 1"):
+        prepare(record_of(gain=0.3), "encoder")
+
+
+def test_a_quantised_probe_is_not_taken_for_a_clipped_one():
+    coarse = MotionRecord.from_arrays(1e-3, STEPS, np.round(-STEPS / 1e-7) * 1e-7)
+    assert prepare(coarse, "encoder").problem.used.any()
+
+
+def test_content_frequency_is_that_of_the_motion():
+    time = np.arange(10_000) * 1e-3
+    assert content_frequency(np.sin(2 * np.pi * 7 * time), 1e-3) == pytest.approx(7.0, abs=0.3)
+    assert content_frequency(STEPS, 1e-3) > 30
+
+
+def test_a_motion_that_breaks_off_ends_at_rest_and_without_new_content():
+    frequency, period, samples = 10.3, 1e-3, 20_000
+    z = 20e-6 * np.sin(2 * np.pi * frequency * period * np.arange(samples) + 0.3)
+    distance = np.random.default_rng(1).normal(-z, 1e-8)
+    problem = prepare(MotionRecord.from_arrays(period, z, distance), "encoder").problem
+    assert not np.any(problem.used[:499])
+    assert not np.any(problem.used[-499:])
+    assert np.mean(problem.used) > 0.94
+
+    def beyond(motion):
+        closed = close_period(motion, period)
+        spectrum = np.abs(np.fft.rfft(closed))
+        lines = np.fft.rfftfreq(len(closed), period) > frequency + 10.0
+        return np.max(spectrum[lines]) / np.max(spectrum)
+
+    assert beyond(problem.motion) < 1e-5
+    assert beyond(z) > 1e-4
+
+
+def test_what_rests_at_both_ends_is_left_as_it_is():
+    recorded = record_of()
+    problem = prepare(recorded, "encoder").problem
+    np.testing.assert_allclose(np.diff(problem.motion), np.diff(recorded.z), atol=1e-18)
+    assert problem.used[60]
+    assert problem.used[-10]

@@ -1,0 +1,70 @@
+"""Places to start from, judged by how near they come to the answer."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.output_error import Problem, fit
+from omsm_ros.core.fitting.starting_points import StartingPoints
+
+PERIOD = 1e-3
+NO_VOTE = HankelVote(np.empty(0), 0, np.empty(0, complex))
+
+
+def points_for(dynamics, vote=NO_VOTE):
+    time = np.arange(4000) * PERIOD
+    motion = sum(1e-5 * np.exp(-(((time - c) / 4e-3) ** 2)) for c in np.arange(0.4, 3.6, 0.37))
+    frequency = np.fft.rfftfreq(len(motion), PERIOD)
+    seen = np.fft.irfft(np.fft.rfft(motion) * dynamics.response(frequency), len(motion))
+    seen = seen + np.random.default_rng(1).normal(0, 1e-9, len(motion))
+    used = np.ones(len(motion), bool)
+    problem = Problem(motion, seen, used, PERIOD, np.ones((len(motion), 1)), 300.0)
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    return StartingPoints(problem, lag, vote)
+
+
+def resonance(frequency, damping):
+    omega = 2 * np.pi * frequency
+    return TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
+
+
+def frequencies_of(points, structure, shapes):
+    scaled = Scaled(structure, points.problem.rate)
+    return [scaled.transfer_function(s, np.ones(1)).modes()[0].frequency for s in shapes]
+
+
+@pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.02), (80.0, 0.05), (140.0, 0.01)])
+def test_linear_least_squares_finds_a_resonance_no_guess_would(frequency, damping):
+    points = points_for(resonance(frequency, damping))
+    structure = Structure(2, 0, False)
+    found = frequencies_of(points, structure, points.of(structure, []))
+    assert min(abs(f / frequency - 1) for f in found) < 0.01
+
+
+def test_the_poles_of_the_subspace_method_are_one_start():
+    poles = np.array([-20 + 400j, -20 - 400j])
+    points = points_for(resonance(50.0, 0.3), HankelVote(np.array([2.0, 1.5]), 2, poles))
+    structure = Structure(2, 0, False)
+    found = frequencies_of(points, structure, points.of(structure, []))
+    assert any(f == pytest.approx(abs(poles[0]) / (2 * np.pi)) for f in found)
+
+
+def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():
+    points = points_for(resonance(60.0, 0.1))
+    fits = []
+    for structure in (Structure(1, 0, False), Structure(2, 0, False), Structure(3, 1, False)):
+        fits.append(fit(points.problem, structure, points.of(structure, fits)))
+    costs = [f.sum_of_squares for f in fits]
+    assert costs[0] >= costs[1] * 0.999
+    assert costs[1] >= costs[2] * 0.999
+
+
+def test_every_start_has_the_shape_of_its_structure_and_is_stable():
+    points = points_for(resonance(60.0, 0.1))
+    for structure in (Structure(4, 3, True), Structure(3, 2, False), Structure(0, 0, True)):
+        scaled = Scaled(structure, points.problem.rate)
+        for shape in points.of(structure, []):
+            assert len(shape) == scaled.shape_size
+            assert scaled.transfer_function(shape, np.ones(1)).is_stable

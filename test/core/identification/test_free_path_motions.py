@@ -1,0 +1,95 @@
+"""Motions that never rest identify too, and are trusted no further than they go."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.dynamics.response_band import response_band
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.trajectories import Chirp, Multisine
+from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.surface.nominal import Flat
+from omsm_ros.errors import IdentificationError, StepTestError
+from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+
+OMEGA = 2 * np.pi * 60
+LIGHT_MODE = Plant(TransferFunction.from_ascending([1.0], [1.0, 0.04 / OMEGA, OMEGA**-2]))
+# Starts and ends in full swing.
+FROM_THE_MIDDLE = slice(7321, 21_117)
+WHOLE = slice(None)
+
+
+def identified(motion, plant, part, seed):
+    made = record(Cell(plant=plant, seed=seed), motion, Flat())
+    whole = assemble([made.axes], [made.distance])
+    return identify(
+        MotionRecord.from_arrays(whole.sample_period, whole.z[part], whole.distance[part])
+    )
+
+
+@pytest.mark.parametrize(
+    ("motion", "plant", "part", "reaches"),
+    [
+        (Chirp(), Plant(), WHOLE, 15.0),
+        (Chirp(), LIGHT_MODE, WHOLE, 15.0),
+        (Chirp(), LIGHT_MODE, FROM_THE_MIDDLE, 12.7),
+        (Chirp(end_frequency=50.0, peak_to_peak=20e-6), LIGHT_MODE, FROM_THE_MIDDLE, 42.0),
+        (Multisine(), Plant(), WHOLE, 14.9),
+        (Multisine(), LIGHT_MODE, WHOLE, 14.9),
+    ],
+)
+@pytest.mark.parametrize("seed", [3, 4])
+def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, part, reaches, seed):
+    calibration = identified(motion, plant, part, seed)
+    assert 0.9 * reaches < calibration.valid_up_to < 1.3 * reaches
+    assert calibration.certificate["verdict"].startswith("accepted up to")
+    frequency = np.geomspace(0.5, calibration.valid_up_to, 20)
+    found, truth = (g.response(frequency) for g in (calibration.dynamics, plant.dynamics))
+    error = np.log(found / truth)
+    band = response_band(calibration.dynamics, calibration.covariance, frequency)
+    assert np.max(np.abs(error.real) / band.gain) < 3.5
+    assert np.max(np.abs(error.imag) / band.phase) < 3.5
+
+
+@pytest.mark.parametrize(("frequency", "plant"), [(5.0, Plant()), (5.0, LIGHT_MODE)])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
+    """Gain and phase at one frequency are two numbers; static gain, lag and curvature are three."""
+    sine = Multisine(frequencies=(frequency,), amplitude=20e-6)
+    certificate = identified(sine, plant, WHOLE, seed).certificate
+    assert certificate["verdict"] == "rejected"
+    assert "does not tell the static gain from the dynamics" in certificate["reasons"][0]
+
+
+def test_a_second_frequency_tells_them_apart():
+    sines = Multisine(frequencies=(2.0, 9.0), amplitude=15e-6)
+    calibration = identified(sines, LIGHT_MODE, WHOLE, 1)
+    assert calibration.certificate["verdict"].startswith("accepted")
+    assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_even_ramp_may_be_drift(seed):
+    rng = np.random.default_rng(seed)
+    z = rng.normal(2e-9 * np.arange(20_000), 4e-10)
+    ramp = MotionRecord.from_arrays(1e-3, z, rng.normal(-z, 1e-8))
+    assert any(reason in refusal(ramp) for reason in ("moves to and fro", "static gain from the"))
+
+
+@pytest.mark.parametrize("lost", [slice(35, 85), slice(0)])
+def test_too_little_left_between_the_ends_is_said(lost):
+    z = 20e-6 * np.sin(2 * np.pi * 15e-3 * np.arange(120 if lost.start else 60))
+    distance = np.random.default_rng(0).normal(-z, 1e-8)
+    distance[lost] = np.nan
+    with pytest.raises(StepTestError, match="are left to compare"):
+        identify(MotionRecord.from_arrays(1e-3, z, distance))
+
+
+def refusal(record):
+    """Why nothing was identified."""
+    try:
+        certificate = identify(record).certificate
+    except IdentificationError as error:
+        return str(error)
+    return certificate["reasons"][0]

@@ -1,0 +1,57 @@
+"""Gains from plateaus, and who is wrong."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.identification.static_gains import static_gains
+from omsm_ros.core.machine.trajectories import Chirp, StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import StepTestError
+
+
+def stepped(probe_gain, reference_gain=None, drift=0.0, noise=1e-8, seed=1, count=10):
+    rng = np.random.default_rng(seed)
+    motion = StepTest(count=count)
+    time = np.arange(round(motion.duration / 1e-3)) * 1e-3
+    z = motion.positions(time).z
+    distance = 1e-5 - probe_gain * z + drift * time + rng.normal(0, noise, len(z))
+    reference = (
+        None if reference_gain is None else reference_gain * z + rng.normal(0, noise, len(z))
+    )
+    return MotionRecord.from_arrays(
+        1e-3, z + rng.normal(0, 4e-10, len(z)), distance, reference=reference
+    )
+
+
+def test_gain_is_found_within_its_uncertainty_under_drift():
+    gain = static_gains(stepped(0.9921, drift=2e-9)).probe_per_encoder
+    assert abs(gain.value - 0.9921) < 4 * gain.uncertainty
+    assert 1e-6 < gain.uncertainty < 2e-5
+
+
+def test_uncertainty_is_the_scatter_of_repeated_tests():
+    gains = [static_gains(stepped(1.0, seed=s)).probe_per_encoder for s in range(40)]
+    scatter = np.std([g.value for g in gains])
+    assert np.mean([g.uncertainty for g in gains]) == pytest.approx(scatter, rel=0.4)
+
+
+def test_a_reference_tells_probe_from_encoder():
+    gains = static_gains(stepped(0.99, reference_gain=1.0))
+    assert gains.reference_per_encoder.value == pytest.approx(1.0, abs=3e-5)
+    assert gains.probe_per_reference.value == pytest.approx(0.99, abs=3e-5)
+    wrong_encoder = static_gains(stepped(0.99, reference_gain=0.99))
+    assert wrong_encoder.probe_per_reference.value == pytest.approx(1.0, abs=3e-5)
+    assert wrong_encoder.reference_per_encoder.value == pytest.approx(0.99, abs=3e-5)
+
+
+def test_without_a_reference_there_is_one_gain():
+    gains = static_gains(stepped(1.0))
+    assert gains.probe_per_reference is None
+    assert gains.reference_per_encoder is None
+
+
+def test_a_path_without_plateaus_has_no_static_gain():
+    time = np.arange(10_000) * 1e-3
+    z = Chirp().positions(time).z
+    with pytest.raises(StepTestError, match="plateaus"):
+        static_gains(MotionRecord.from_arrays(1e-3, z, -z))

@@ -1,0 +1,72 @@
+"""Plans that a machine can run and that hide nothing between samples."""
+
+import re
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
+from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.surface.nominal import Flat
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.plant import Plant
+
+PLAN = plan_steps(sample_period=1e-3)
+
+
+def test_the_plan_comes_home():
+    z = PLAN.z(np.array([0.0, PLAN.duration]))
+    np.testing.assert_allclose(z, 0, atol=1e-15)
+    assert np.max(PLAN.z(np.linspace(0, PLAN.duration, 5000))) == pytest.approx(98e-6)
+
+
+def test_edges_are_spread_over_the_sample_period():
+    phase = np.sort((np.array(PLAN.starts) / 1e-3) % 1.0)
+    gaps = np.diff(np.append(phase, phase[0] + 1))
+    assert np.max(gaps) < 0.15
+
+
+def test_a_planned_test_identifies_without_objection():
+    recording = record(Cell(seed=3), PLAN, Flat(), stand_off=-49e-6)
+    calibration = identify(assemble([recording.axes], [recording.distance]))
+    assert str(calibration.certificate["verdict"]).startswith("accepted")
+    ratio = calibration.dynamics.response(1.0) / Plant().dynamics.response(1.0)
+    assert abs(np.degrees(np.angle(ratio))) < 2e-3
+
+
+def test_csv_is_the_motion():
+    lines = plan_csv(PLAN, 1e-2).splitlines()
+    assert lines[0] == "time_s,z_m"
+    values = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
+    np.testing.assert_allclose(values[:, 1], PLAN.z(values[:, 0]), atol=1e-17)
+    assert values[-1, 0] == pytest.approx(PLAN.duration)
+
+
+def test_gcode_moves_add_up_to_nothing_and_last_as_planned():
+    text = plan_gcode(PLAN)
+    moves = [float(m) for m in re.findall(r"^G1 Z(\S+)", text, re.M)]
+    feeds = [float(m) for m in re.findall(r"^G1 .* F(\S+)", text, re.M)]
+    rests = [float(m) for m in re.findall(r"^G4 P(\S+)", text, re.M)]
+    assert len(moves) == 20
+    assert sum(moves) == pytest.approx(0, abs=1e-12)
+    moving = sum(abs(move) / feed * 60 for move, feed in zip(moves, feeds, strict=True))
+    assert moving + sum(rests) == pytest.approx(PLAN.duration, abs=1e-3)
+    assert "G21" in text
+    assert text.rstrip().endswith("M2")
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"rise": 5e-3}, "too sharp"),
+        ({"count": 11}, "range"),
+        ({"count": 0}, "positive"),
+        ({"dwell": 0.05}, "no rest"),
+        ({"sample_period": 0.0}, "positive"),
+    ],
+)
+def test_a_plan_that_cannot_work_is_refused(options, match):
+    with pytest.raises(ConfigurationError, match=match):
+        plan_steps(**{"sample_period": 1e-3, **options})

@@ -1,0 +1,189 @@
+"""Axes and probe with clocks of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
+from omsm_ros.core.samples.joining_by_stamp import axes_at_probe, fit_clock
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.twin.cell import Cell, Probe, blocks_of, record
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+
+
+def motion(time: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        "x": 12e-3 - 5e-5 * time,
+        "y": np.zeros_like(time),
+        "z": 0.5e-3 * np.sin(2 * np.pi * 6.0 * time),
+        "b": np.zeros_like(time),
+        "c": np.pi * time,
+    }
+
+
+def axis_blocks(
+    rate: float = 4000.0, start: float = 0.0, seconds: float = 2.0, jitter: float = 0.0
+) -> list[AxisBlock]:
+    """Blocks of 100 samples whose true times are ``start + k / rate``."""
+    random = np.random.default_rng(7)
+    blocks = []
+    for first in range(0, round(seconds * rate), 100):
+        time = start + (first + np.arange(100)) / rate
+        stamp = time[0] + jitter * random.normal()
+        blocks.append(
+            AxisBlock(
+                stamp_ns=round(stamp * 1e9),
+                first_sample=first,
+                sample_period=1 / rate,
+                **motion(time),
+            )
+        )
+    return blocks
+
+
+def probe_blocks(
+    rate: float = 1000.0, start: float = 0.1, seconds: float = 1.5
+) -> list[DistanceBlock]:
+    return [
+        DistanceBlock(
+            stamp_ns=round((start + first / rate) * 1e9),
+            first_sample=50_000 + first,
+            sample_period=1 / rate,
+            distance=np.zeros(70),
+        )
+        for first in range(0, round(seconds * rate) - 70, 70)
+    ]
+
+
+def joined(blocks: list[AxisBlock]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    values = {n: np.concatenate([getattr(b, n) for b in blocks]) for n in "xyzbc"}
+    time = np.concatenate([b.stamp_ns * 1e-9 + np.arange(len(b)) * b.sample_period for b in blocks])
+    return time, values
+
+
+@pytest.mark.parametrize("rate", [700.0, 1000.0, 4321.0])
+def test_axes_are_interpolated_to_the_probes_times(rate: float) -> None:
+    found = axes_at_probe(axis_blocks(rate, start=0.0123e-3), probe_blocks())
+    time, values = joined(found)
+    expected = motion(time)
+    assert np.allclose(values["z"], expected["z"], rtol=0, atol=0.1e-9)
+    assert np.allclose(values["c"], expected["c"], rtol=0, atol=1e-9)
+
+
+def test_blocks_carry_the_probes_counts_and_stamps() -> None:
+    probe = probe_blocks()
+    found = axes_at_probe(axis_blocks(), probe)
+    assert [(b.first_sample, b.stamp_ns, b.sample_period, len(b)) for b in found] == [
+        (b.first_sample, b.stamp_ns, b.sample_period, len(b)) for b in probe
+    ]
+
+
+def test_a_delay_of_the_probe_is_taken_off() -> None:
+    _, values = joined(axes_at_probe(axis_blocks(), probe_blocks(), delay=0.4e-3))
+    time, _ = joined(axes_at_probe(axis_blocks(), probe_blocks()))
+    assert np.allclose(values["z"], motion(time + 0.4e-3)["z"], rtol=0, atol=0.1e-9)
+
+
+def test_an_exposure_averages_the_motion() -> None:
+    exposure = 5e-3
+    time, values = joined(axes_at_probe(axis_blocks(), probe_blocks(), exposure=exposure))
+    expected = motion(time)["z"] * np.sinc(6.0 * exposure)
+    assert np.allclose(values["z"], expected, rtol=0, atol=0.2e-9)
+    assert 1 - np.sinc(6.0 * exposure) > 1e-4
+
+
+def test_jitter_of_stamps_is_averaged_over_the_session() -> None:
+    blocks = axis_blocks(jitter=0.2e-3, seconds=20.0)
+    clock = fit_clock(blocks)
+    assert clock.jitter == pytest.approx(0.2e-3, rel=0.1)
+    time = clock.since(np.array([0.0, 40_000.0]), 0)
+    # 800 stamps know their line to jitter / sqrt(800), at the ends to twice that.
+    assert np.allclose(time, [0.0, 10.0], rtol=0, atol=50e-6)
+
+
+def test_a_clock_that_runs_fast_is_followed() -> None:
+    true_rate = 1000.0 * (1 + 50e-6)
+    blocks = [
+        Block(stamp_ns=round(k * 100 / true_rate * 1e9), first_sample=k * 100, sample_period=1e-3)
+        for k in range(600)
+    ]
+    clock = fit_clock(blocks)
+    assert clock.period_ns == pytest.approx(1e9 / true_rate, rel=1e-9)
+
+
+def test_stamps_in_time_lapse_are_refused() -> None:
+    blocks = [replace(b, stamp_ns=b.stamp_ns // 10) for b in axis_blocks()]
+    with pytest.raises(DataError, match="time lapse"):
+        fit_clock(blocks)
+
+
+def test_what_the_axes_do_not_cover_is_no_number() -> None:
+    axes = axis_blocks()
+    found = axes_at_probe(axes[:30] + axes[40:], probe_blocks(start=-0.05))
+    time, values = joined(found)
+    lost = ~np.isfinite(values["z"])
+    gap = (time > 2999 / 4000) & (time < 1.0 - 1e-9)
+    assert np.array_equal(lost, gap | (time < 0))
+
+
+def test_repeated_blocks_bring_nothing_new() -> None:
+    axes = axis_blocks()
+    once = joined(axes_at_probe(axes, probe_blocks()))[1]["z"]
+    twice = joined(axes_at_probe([b for a in axes for b in (a, a)], probe_blocks()))[1]["z"]
+    assert np.array_equal(once, twice)
+
+
+def test_a_count_that_wraps_keeps_its_time() -> None:
+    axes = axis_blocks()
+    wrapped = [replace(b, first_sample=(b.first_sample + 2**32 - 4000) % 2**32) for b in axes]
+    plain = joined(axes_at_probe(axes, probe_blocks()))[1]["z"]
+    assert np.array_equal(joined(axes_at_probe(wrapped, probe_blocks()))[1]["z"], plain)
+
+
+def test_too_few_axis_samples_are_refused() -> None:
+    with pytest.raises(DataError, match="long enough"):
+        axes_at_probe([], probe_blocks())
+
+
+@pytest.mark.parametrize("wrong", [{"exposure": -1e-3}, {"exposure": np.inf}, {"delay": np.nan}])
+def test_a_senseless_exposure_or_delay_is_named(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigurationError, match=next(iter(wrong))):
+        axes_at_probe(axis_blocks(), probe_blocks(), **wrong)
+
+
+def test_a_scan_with_two_clocks_is_corrected_like_one_with_a_trigger() -> None:
+    probe = Probe(noise=0.0, resolution=0.0)
+    spiral = Spiral(PAPER_MIRROR, start_radius=12.7e-3, feed_per_turn=5e-3, spindle_speed=30.0)
+    made = record(Cell(probe=probe, encoder_noise=0.0, sample_period=0.25e-3), spiral, PAPER_MIRROR)
+    # The probe reads every fourth of the fine samples and counts them for itself.
+    every = slice(3, None, 4)
+    read = DistanceBlock(
+        stamp_ns=round(3 * 0.25e-3 * 1e9),
+        first_sample=9,
+        sample_period=1e-3,
+        distance=made.distance.distance[every],
+        status=made.distance.status[every],
+    )
+    axes = axes_at_probe([a for a, _ in blocks_of(made, 100)], [read])
+    known = Calibration(
+        dynamics=Plant().dynamics,
+        static_gain=PAPER_STATIC_GAIN,
+        sample_period=1e-3,
+        valid_up_to=100.0,
+        covariance=np.zeros((7, 7)),
+    )
+    corrector = Corrector(known, CorrectionOptions())
+    for block in axes:
+        corrector.push_axes(block)
+    corrector.push_distance(read)
+    points = join_points([corrector.finish()])
+    truth = made.surface_height[every][points.sample - 9]
+    assert len(points) > 4900
+    assert np.max(abs(points.height - truth)) < 0.1e-9

@@ -1,0 +1,150 @@
+"""The sideways lag, recovered from two scans of the twin in opposite directions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
+from omsm_ros.core.verification.reversal import delay_uncertainty, sideways_lag
+from omsm_ros.errors import DataError
+from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+
+LATENCY = 0.34e-3
+PROMPT = TransferFunction(np.ones(1), np.array([1.0, 1 / (2 * np.pi * 5000)]))
+
+
+def calibration(dynamics: TransferFunction, delay_variance: float = 0.0) -> Calibration:
+    p = len(dynamics.numerator) + len(dynamics.denominator)
+    covariance = np.zeros((p, p))
+    covariance[-1, -1] = delay_variance
+    return Calibration(
+        dynamics=dynamics,
+        static_gain=PAPER_STATIC_GAIN,
+        sample_period=1e-3,
+        valid_up_to=100.0,
+        covariance=covariance,
+    )
+
+
+LATE = calibration(TransferFunction(PROMPT.numerator, PROMPT.denominator, LATENCY))
+MECHANICAL = calibration(Plant().dynamics)
+
+
+def scan(
+    speed: float,
+    seed: int,
+    known: Calibration,
+    cell: Cell,
+    surface: Surface = PAPER_MIRROR,
+    lateral_lag: float = 0.0,
+    feed: float = 2e-3,
+) -> SurfacePoints:
+    spiral = Spiral(surface, start_radius=12.7e-3, feed_per_turn=feed, spindle_speed=speed)
+    recording = record(replace(cell, seed=seed), spiral, surface)
+    corrector = Corrector(known, CorrectionOptions(lateral_lag=lateral_lag))
+    corrector.push_axes(recording.axes)
+    corrector.push_distance(recording.distance)
+    return join_points([corrector.finish()])
+
+
+LATE_CELL = Cell(plant=Plant(dynamics=PROMPT), latency=LATENCY)
+
+
+@pytest.fixture(scope="module")
+def late_scans() -> list[SurfacePoints]:
+    return [scan(30.0, 1, LATE, LATE_CELL), scan(-30.0, 2, LATE, LATE_CELL)]
+
+
+def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[SurfacePoints]) -> None:
+    found = sideways_lag(late_scans, LATE)
+    assert found.uncertainty < 1e-6
+    assert abs(found.lag - LATENCY) < 3 * found.uncertainty
+    assert found.residual == pytest.approx(10.5e-9, rel=0.05)
+
+
+def test_a_mechanical_lag_is_not_sideways() -> None:
+    scans = [scan(30.0, 1, MECHANICAL, Cell()), scan(-30.0, 2, MECHANICAL, Cell())]
+    found = sideways_lag(scans, MECHANICAL)
+    assert abs(found.lag) < 3 * found.uncertainty
+    assert found.latency is False
+    assert found.lag_of_z == pytest.approx(0.3397e-3, abs=1e-7)
+
+
+def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[SurfacePoints]) -> None:
+    total = LATE.dynamics.low_frequency_delay
+    known = replace(LATE, covariance=calibration(LATE.dynamics, (20e-6) ** 2).covariance)
+    found = sideways_lag(late_scans, known)
+    assert found.lag_of_z == total
+    assert found.latency is True
+
+
+def test_a_poorly_known_delay_of_the_calibration_limits_the_estimate(
+    late_scans: list[SurfacePoints],
+) -> None:
+    vague = replace(LATE, covariance=calibration(LATE.dynamics, (50e-6) ** 2).covariance)
+    assert sideways_lag(late_scans, vague).uncertainty == pytest.approx(50e-6, rel=1e-3)
+
+
+def test_with_the_lag_corrected_nothing_is_left() -> None:
+    scans = [
+        scan(speed, seed, LATE, LATE_CELL, lateral_lag=LATENCY)
+        for speed, seed in ((30.0, 1), (-30.0, 2))
+    ]
+    found = sideways_lag(scans, LATE)
+    assert abs(found.lag) < 3 * found.uncertainty
+
+
+def test_the_stated_uncertainty_is_that_of_repetition() -> None:
+    errors, stated = [], 0.0
+    for seed in range(12):
+        pair = [scan(s * 30.0, 2 * seed + (s > 0), LATE, LATE_CELL, feed=4e-3) for s in (1, -1)]
+        found = sideways_lag(pair, LATE, degree=6)
+        errors.append(found.lag - LATENCY)
+        stated = found.uncertainty
+    # The scatter of twelve has a relative uncertainty of 21 %.
+    assert 0.5 < np.std(errors) / stated < 1.7
+
+
+def test_scans_in_one_direction_are_refused(late_scans: list[SurfacePoints]) -> None:
+    with pytest.raises(DataError, match="turn the same way"):
+        sideways_lag([late_scans[0], late_scans[0]], LATE)
+
+
+def test_a_single_scan_is_refused(late_scans: list[SurfacePoints]) -> None:
+    with pytest.raises(DataError, match="1 scan"):
+        sideways_lag(late_scans[:1], LATE)
+
+
+def test_a_short_scan_is_refused(late_scans: list[SurfacePoints]) -> None:
+    few = join_points([])
+    with pytest.raises(DataError, match="scan of 0 points"):
+        sideways_lag([late_scans[0], few], LATE)
+
+
+def test_a_surface_of_revolution_tells_nothing_about_a_lag() -> None:
+    bowl = Sphere(0.5)
+    pair = [scan(s, 1, LATE, LATE_CELL, bowl) for s in (30.0, -30.0)]
+    found = sideways_lag(pair, LATE)
+    assert found.uncertainty > 10e-6
+
+
+def test_low_frequency_delay_uncertainty_follows_by_perturbation() -> None:
+    rng = np.random.default_rng(5)
+    g = Plant().dynamics
+    values = np.concatenate([g.numerator, g.denominator[1:], [1e-4]])
+    mixing = rng.normal(size=(7, 7))
+    covariance = 1e-12 * np.outer(values, values) * (mixing @ mixing.T)
+    known = replace(MECHANICAL, covariance=covariance)
+    draws = values + rng.multivariate_normal(np.zeros(7), mixing @ mixing.T, 4000) * 1e-6 * values
+    delays = [TransferFunction(d[:3], np.r_[1.0, d[3:6]], d[6]).low_frequency_delay for d in draws]
+    assert delay_uncertainty(known) == pytest.approx(np.std(delays), rel=0.05)

@@ -1,0 +1,95 @@
+"""Values and uncertainties are rounded to the same place and keep their units."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omsm_ros.report.common.measured import measured, number, plain, probability, raised
+
+FACTORS = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
+
+
+def spaced(text):
+    return text.replace("\u202f", " ").replace("−", "-")
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "unit", "expected"),
+    [
+        (339.7344e-6, 1.128e-6, "s", "339.7 µs ± 1.1 µs"),
+        (0.9921261096, 3.43e-6, "", "0.9921261 ± 0.0000034"),
+        (246.4, 412.3, "Hz", "246 Hz ± 410 Hz"),
+        (916.5, 1303.0, "Hz", "0.9 kHz ± 1.3 kHz"),
+        (999.96e-6, 0.2e-6, "s", "999.96 µs ± 0.20 µs"),
+        (-7873.9, 3.44, "", "-7873.9 ± 3.4"),
+        (5.0, 0.996, "", "5.0 ± 1.0"),
+        (2.2e-6, 100e-6, "s", "2 µs ± 100 µs"),
+        (339.7344e-6, None, "s", "339.7 µs"),
+        (339.7344e-6, 0.0, "s", "339.7 µs"),
+        (0.992126, None, "", "0.9921"),
+        (0.0, None, "s", "0 s"),
+        (None, 1.0, "s", "–"),
+        (math.nan, 1.0, "s", "–"),
+        ("12", 1.0, "s", "–"),
+        (True, 1.0, "s", "–"),
+    ],
+)
+def test_reads_as_it_should(value, uncertainty, unit, expected):
+    assert spaced(measured(value, uncertainty, unit)) == expected
+
+
+@given(
+    st.floats(1e-8, 1e6) | st.floats(-1e6, -1e-8),
+    st.floats(1e-8, 1e5),
+    st.sampled_from(["s", "Hz", "m"]),
+)
+def test_what_is_read_back_is_what_was_written_within_the_uncertainty(value, uncertainty, unit):
+    """Read as a reader does: number, prefix, unit."""
+    text = spaced(measured(value, uncertainty, unit))
+    found = re.fullmatch(rf"(-?[\d.]+) (\D?){unit} ± ([\d.]+) (\D?){unit}", text)
+    assert found, text
+    assert found[2] == found[4]
+    scale = FACTORS[found[2]]
+    # Nine decimals of the unit at most.
+    rounding = 0.5e-9 * scale
+    assert abs(float(found[1]) * scale - value) <= 0.0501 * uncertainty + rounding
+    assert abs(float(found[3]) * scale / uncertainty - 1) <= 0.0501 + rounding / uncertainty
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "expected"),
+    [
+        (1.012, 3, "1.01"),
+        (1.0, 3, "1.00"),
+        (0, 3, "0"),
+        (123.4, 3, "123"),
+        (27354.8, 3, "2.74 · 10⁴"),
+        (-1858632.4, 4, "-1.859 · 10⁶"),
+        (7.4834616e-4, 9, "7.48346160 · 10⁻⁴"),
+        (None, 3, "–"),
+        (math.inf, 3, "–"),
+    ],
+)
+def test_plain_numbers(value, digits, expected):
+    assert spaced(plain(value, digits)) == expected
+
+
+def test_probabilities():
+    assert [probability(p) for p in (0.6677, 1.0, 3e-9, 0.0, None)] == [
+        "0.668", "1", "< 0.0001", "< 0.0001", "–",
+    ]  # fmt: skip
+
+
+def test_only_finite_numbers_are_numbers():
+    assert [number(v) for v in (1, 2.5, True, "3", None, math.nan, math.inf, [])] == [
+        1.0, 2.5, None, None, None, None, None, None,
+    ]  # fmt: skip
+
+
+def test_powers_are_raised():
+    assert raised(-12) == "⁻¹²"

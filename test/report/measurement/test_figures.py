@@ -1,0 +1,179 @@
+"""What stands in the figures: values, units, limits, labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.deviation import Profile
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.report.common import style
+from omsm_ros.report.measurement import figures
+from omsm_ros.twin.plant import Plant
+
+
+@pytest.fixture(scope="module")
+def deviations(cloud):
+    weights = form.spiral_weights(cloud.x, cloud.y)
+    return {
+        name: form.level(
+            cloud.x,
+            cloud.y,
+            form.deviation(cloud.x, cloud.y, height, PAPER_MIRROR),
+            weights=weights,
+        )
+        for name, height in (("raw", cloud.raw_height), ("corrected", cloud.height))
+    }
+
+
+def texts(figure):
+    """All that is written on the axes."""
+    found = []
+    for axes in figure.get_axes():
+        found += [axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left")]
+        found += [text.get_text() for text in axes.texts]
+        if axes.get_legend():
+            found += [text.get_text() for text in axes.get_legend().get_texts()]
+    return set(found) - {""}
+
+
+class TestDeviationMap:
+    @pytest.mark.parametrize(("unit", "size"), [("nm", 1e-9), ("µm", 1e-6), ("mm", 1e-3)])
+    def test_pixels_are_in_the_unit_of_the_scale(self, cloud, unit, size):
+        figure = figures.deviation_map(
+            cloud.x, cloud.y, np.full(len(cloud), 5 * size), unit=unit, title="Five"
+        )
+        image = figure.get_axes()[0].get_images()[0].get_array()
+        assert np.nanmin(image) == pytest.approx(5)
+        assert np.nanmax(image) == pytest.approx(5)
+        assert {"x [mm]", "y [mm]", f"deviation [{unit}]", "Five"} <= texts(figure)
+
+    def test_axes_are_millimetres_of_equal_length(self, cloud):
+        figure = figures.deviation_map(cloud.x, cloud.y, cloud.x, unit="mm", title="")
+        axes = figure.get_axes()[0]
+        assert axes.get_aspect() == 1
+        assert axes.get_images()[0].get_extent() == pytest.approx(
+            [-12.7, 12.7, -12.7, 12.7], abs=0.3
+        )
+
+    def test_two_maps_with_the_same_limits_have_the_same_colours(self, cloud, deviations):
+        limits = figures.symmetric_limits(cloud.x, cloud.y, deviations["raw"])
+        drawn = [
+            figures.deviation_map(cloud.x, cloud.y, d, unit="µm", title="", limits=limits)
+            for d in deviations.values()
+        ]
+        one, other = (f.get_axes()[0].get_images()[0].get_clim() for f in drawn)
+        assert one == other == pytest.approx(np.array(limits) / 1e-6)
+
+    def test_own_limits_hold_nearly_all_and_are_symmetric(self, cloud, deviations):
+        low, high = figures.symmetric_limits(cloud.x, cloud.y, deviations["raw"])
+        assert low == -high
+        assert np.mean(np.abs(deviations["raw"]) <= high) > 0.99
+
+    def test_one_outlier_does_not_take_the_colours(self, cloud, deviations):
+        spoilt = deviations["corrected"].copy()
+        spoilt[9] = 1e-3
+        expected = figures.symmetric_limits(cloud.x, cloud.y, deviations["corrected"])
+        assert figures.symmetric_limits(cloud.x, cloud.y, spoilt) == pytest.approx(
+            expected, rel=0.1
+        )
+
+    @pytest.mark.parametrize(
+        ("limits", "extend"),
+        [((-1, 1), "neither"), ((-1e-9, 1), "min"), ((-1, 1e-9), "max"), ((-1e-9, 1e-9), "both")],
+    )
+    def test_the_scale_says_where_it_is_clipped(self, cloud, deviations, limits, extend):
+        figure = figures.deviation_map(
+            cloud.x, cloud.y, deviations["raw"], unit="µm", title="", limits=limits
+        )
+        assert figure.get_axes()[0].get_images()[0].colorbar.extend == extend
+
+    def test_a_perfect_surface_is_drawn(self, cloud):
+        assert figures.symmetric_limits(cloud.x, cloud.y, np.zeros(len(cloud)))[1] > 0
+
+    def test_an_unknown_unit_is_refused(self, cloud):
+        with pytest.raises(ConfigurationError, match="unit 'inch'"):
+            figures.deviation_map(cloud.x, cloud.y, cloud.x, unit="inch", title="")
+
+
+class TestProfile:
+    CUT = Profile(1e-3 * np.arange(5.0), 1e-6 * np.arange(5.0), np.ones(5, np.int64))
+
+    def test_above_in_micrometres_below_in_nanometres(self):
+        figure = figures.profile(self.CUT, self.CUT, title="Along x", position="x")
+        upper, lower = figure.get_axes()
+        for axes, values in ((upper, np.arange(5.0)), (lower, 1e3 * np.arange(5.0))):
+            line = axes.get_lines()[0]
+            assert line.get_xdata() == pytest.approx(np.arange(5.0))
+            assert line.get_ydata() == pytest.approx(values)
+        assert {"deviation [µm]", "deviation [nm]", "x [mm]", "Along x"} <= texts(figure)
+
+    def test_a_gap_in_the_cloud_breaks_the_line(self):
+        position = np.r_[np.arange(10.0), np.arange(20.0, 30.0)] * 1e-3
+        cut = Profile(position, np.ones(20), np.ones(20, np.int64))
+        line = figures.profile(cut, cut, title="", position="x").get_axes()[0].get_lines()[0]
+        assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [10]
+
+    def test_the_truth_is_drawn_where_known(self):
+        figure = figures.profile(self.CUT, self.CUT, title="", position="x", true=self.CUT)
+        assert "true" in texts(figure)
+        assert "true" not in texts(figures.profile(self.CUT, self.CUT, title="", position="x"))
+
+
+class TestDynamicError:
+    def test_the_largest_error_is_drawn_in_its_unit(self):
+        before, after = np.zeros(50_000), np.zeros(50_000)
+        before[777], after[778] = 2e-6, -3e-9
+        figure = figures.dynamic_error(1e-3 * np.arange(50_000), before, after=after)
+        upper, lower = figure.get_axes()
+        assert upper.dataLim.ymax == pytest.approx(2.0, rel=0.2)
+        assert lower.dataLim.ymin == pytest.approx(-3.0, rel=0.2)
+        assert {"before [µm]", "after [nm]", "time [s]"} <= texts(figure)
+
+    def test_without_the_truth_the_uncertainty_stands_below(self, cloud):
+        figure = figures.dynamic_error(
+            cloud.time, cloud.dynamic_error, uncertainty=cloud.uncertainty
+        )
+        assert figure.get_axes()[1].dataLim.ymax == pytest.approx(22.0)
+        assert "±2u of a height" in texts(figure)
+        assert "true error left" not in texts(figure)
+
+    def test_alone_it_is_one_panel(self, cloud):
+        figure = figures.dynamic_error(cloud.time, cloud.dynamic_error)
+        assert len(figure.get_axes()) == 1
+        assert {"before [µm]", "time [s]"} <= texts(figure)
+
+
+class TestErrorHistogram:
+    def test_both_add_up_to_the_whole_area(self):
+        random = np.random.default_rng(1)
+        before, after = random.normal(0, 1e-6, 5000), random.normal(0, 1e-9, 5000)
+        weights = random.uniform(0.1, 2.0, 5000)
+        axes = figures.error_histogram(before, after, weights).get_axes()[0]
+        shares = [patch.get_data().values for patch in axes.patches]
+        assert [share.sum() for share in shares] == pytest.approx([100, 100])
+
+    def test_weighs_by_area(self):
+        before = np.r_[np.full(10, 1e-6), np.full(10, 1e-8)]
+        weights = np.r_[np.full(10, 3.0), np.full(10, 1.0)]
+        axes = figures.error_histogram(before, before, weights).get_axes()[0]
+        values = axes.patches[0].get_data().values
+        assert values[values > 0] == pytest.approx([25, 75])
+
+    def test_no_error_at_all_is_drawn(self):
+        nothing = np.zeros(10)
+        style.png(figures.error_histogram(nothing, nothing, np.ones(10)), dpi=40)
+
+
+def test_the_overview_has_two_maps_in_two_units_and_a_bode_plot(cloud, deviations, certified):
+    figure = figures.overview_figure(
+        cloud.x, cloud.y, deviations["raw"], deviations["corrected"], certified, Plant().dynamics
+    )
+    assert {
+        "deviation [µm]", "deviation [nm]", "gain [1]", "phase [deg]", "frequency [Hz]", "true",
+    } <= texts(figure)  # fmt: skip
+    width, height = figure.get_size_inches()
+    assert width > 3 * height
+    assert style.png(figure, dpi=50).startswith(b"\x89PNG")

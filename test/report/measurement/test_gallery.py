@@ -1,0 +1,76 @@
+"""One call makes all figures of a scan, by the names the page knows."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.errors import DataError
+from omsm_ros.report.measurement.cloud_view import CloudView
+from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.report.measurement.page import CAPTIONS, MAPS, PROFILES
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def part_of(cloud, chosen):
+    return replace(cloud, **{f.name: getattr(cloud, f.name)[chosen] for f in fields(cloud)})
+
+
+def test_with_nominal_and_truth_it_is_all_there(cloud):
+    made = surface_figures(
+        cloud,
+        PAPER_MIRROR,
+        true_height=cloud.height,
+        true_error_left=np.full(len(cloud), 1e-10),
+    )
+    assert set(made) == (
+        {"raw_map", "corrected_map_same_scale", "corrected_map"}
+        | set(PROFILES)
+        | {"dynamic_error", "error_histogram"}
+    )
+    assert all(picture.startswith(PNG) for picture in made.values())
+
+
+def test_without_a_nominal_surface_it_shows_height_and_error(cloud):
+    made = surface_figures(cloud, None)
+    assert set(made) == {"height_map", "error_map", "dynamic_error"}
+    assert set(made) <= set(CAPTIONS)
+    assert {"height_map", "error_map"} <= set(MAPS)
+
+
+@pytest.mark.parametrize("points", [1, 3, 200])
+def test_a_few_points_are_no_reason_to_fail(cloud, points):
+    few = part_of(cloud, slice(0, points))
+    assert "raw_map" in surface_figures(few, PAPER_MIRROR)
+
+
+def test_a_wide_feed_still_has_profiles(cloud):
+    share = np.arange(4000) / 4000
+    radius, angle = PAPER_MIRROR_RADIUS_M * (1 - share), 2 * np.pi * 8 * share
+    few = part_of(cloud, slice(0, 4000))
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    wide = replace(few, x=x, y=y, height=PAPER_MIRROR.height(x, y))
+    assert set(PROFILES) <= set(surface_figures(wide, PAPER_MIRROR))
+
+
+def test_a_piece_off_the_axes_has_a_map_but_not_all_profiles(cloud):
+    piece = np.hypot(cloud.x - 8e-3, cloud.y - 4e-3) < 2e-3
+    made = surface_figures(part_of(cloud, piece), PAPER_MIRROR)
+    assert "corrected_map" in made
+    assert "profile_x" not in made
+    assert "profile_radius" not in made
+
+
+def test_a_cloud_of_unequal_columns_is_refused(cloud):
+    with pytest.raises(DataError, match="'x': 3"):
+        replace(cloud, x=np.zeros(3))
+
+
+def test_an_empty_cloud_is_refused():
+    empty = np.empty(0)
+    with pytest.raises(DataError, match="1 or more"):
+        CloudView(**{f.name: empty for f in fields(CloudView)})
