@@ -17,7 +17,7 @@ LAYERS = [
     {"report", "storage", "devices", "emulators"},
     {"twin", "protocols"},
     {"core"},
-    {"errors", "units"},
+    {"errors", "units", "sosfilt"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 

@@ -14,12 +14,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import polynomial
-from scipy import signal
 
 from omsm_ros.core.dynamics.polynomial_hold import held_zeros
+from omsm_ros.core.dynamics.second_order_sections import bilinear_roots, second_order_sections
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.sosfilt import sosfilt
 
 DEFAULT_ORDER = 3
 # Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.
@@ -59,7 +60,8 @@ class DigitalFilter:
         """Standard deviation out per standard deviation in, for white noise."""
         pulse = np.zeros(self.settling_samples(1e-9) + 1)
         pulse[0] = 1.0
-        return float(np.linalg.norm(signal.sosfilt(self.sections, pulse)))
+        at_rest = np.zeros((len(self.sections), 2))
+        return float(np.linalg.norm(sosfilt(self.sections, pulse, at_rest)))
 
 
 def discretise(
@@ -123,8 +125,8 @@ def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) 
     """Second-order sections of ``late`` whole samples of delay and Π(1 - z_i/z) / Π(1 - p_i/z)."""
     pairs, single = divmod(late, 2)
     delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
-    # zpk2sos counts zeros and poles alike: what it pads lies at the origin, a factor of 1 here.
-    return np.vstack([signal.zpk2sos(zeros, poles, gain), *np.reshape(delays, (-1, 1, 6))])
+    rational = second_order_sections(zeros, poles, gain)
+    return np.vstack([rational, *np.reshape(delays, (-1, 1, 6))])
 
 
 def bilinear(
@@ -133,8 +135,8 @@ def bilinear(
     """The bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
     roots = dynamics.poles() if poles is None else poles
-    zpk = signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
-    return DigitalFilter(np.asarray(signal.zpk2sos(*zpk)), sample_period)
+    zeros, digital, gain = bilinear_roots(dynamics.zeros(), roots, leading, sample_period)
+    return DigitalFilter(second_order_sections(zeros, digital, gain), sample_period)
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:

@@ -10,10 +10,10 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from scipy import signal
 
 from omsm_ros.core.dynamics.discretisation import DigitalFilter
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.sosfilt import sosfilt
 
 # Position, velocity, acceleration.
 POLYNOMIAL_DEGREE = 2
@@ -62,8 +62,7 @@ class Recursion:
 
     def run(self, samples: FloatArray) -> FloatArray:
         """Response to ``samples`` (n,), shape (n,); bit-identical however the stream is cut."""
-        response, self._state = signal.sosfilt(self._sections, samples, zi=self._state)
-        return np.asarray(response, np.float64)
+        return sosfilt(self._sections, samples, self._state)
 
 
 def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:

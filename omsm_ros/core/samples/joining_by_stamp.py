@@ -12,15 +12,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from scipy import interpolate
 
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import NANOSECONDS_PER_S
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 _SPLINE_DEGREE = 5
 # Gauss and Legendre: nodes in half exposures, and their weights.
@@ -117,15 +119,18 @@ class _Track:
     origin_ns: int
     begin: float
     end: float
-    spline: interpolate.BSpline | None
+    spline: BSpline | None
 
     @classmethod
     def of(cls, run: Sequence[AxisBlock], clock: Clock) -> _Track:
         values = np.stack([np.concatenate([getattr(b, name) for b in run]) for name in _AXES], 1)
         count = run[0].first_sample + np.arange(len(values), dtype=np.float64)
         time = clock.since(count, run[0].stamp_ns)
+        # Here, because it takes longer to load than a scan to correct, and few need it.
+        from scipy.interpolate import make_interp_spline
+
         usable = len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values)))
-        spline = interpolate.make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
+        spline = make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
         return cls(run[0].stamp_ns, float(time[0]), float(time[-1]), spline)
 
 
