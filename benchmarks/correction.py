@@ -58,7 +58,7 @@ def true_calibration(relative: float = 1e-3) -> Calibration:
 def identified_calibration(seed: int = 1) -> Calibration:
     """What the paper's step test, run on the twin, supports."""
     test = step_test_of(Scenario(seed=seed))
-    return identify(assemble([test.axes], [test.distance]))
+    return identify(assemble([test.axes], [test.distance])).calibration
 
 
 def scan(spindle_speed: float = 30.0, seed: int = 2, cell: Cell | None = None) -> Recording:

@@ -39,7 +39,7 @@ def rows(runs: int = 100) -> Iterator[Row]:
     """Least share over frequency of runs whose band holds the truth, and how far it is trusted."""
     for name, motion, plant, part, reaches in _CASES:
         found = [
-            identify(_recorded(seed, motion, plant, part))
+            identify(_recorded(seed, motion, plant, part)).calibration
             for seed in range(_FIRST_SEED, _FIRST_SEED + runs)
         ]
         # The least share of ten: chance alone takes it below 95 %.

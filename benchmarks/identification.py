@@ -92,7 +92,7 @@ class Runs:
 
 def monte_carlo(seeds: range, make: Callable[[int], MotionRecord], truth: TransferFunction) -> Runs:
     """Identify one recording a seed."""
-    calibrations = [identify(make(seed)) for seed in seeds]
+    calibrations = [identify(make(seed)).calibration for seed in seeds]
     stated = [response_band(c.dynamics, c.covariance, FREQUENCIES) for c in calibrations]
     bound = [response_band(c.dynamics, _from_noise(c), FREQUENCIES) for c in calibrations]
     return Runs(
@@ -239,7 +239,7 @@ def other_plants(runs: int = 20) -> list[Row]:
     late = TransferFunction(np.ones(1), np.ones(1), 0.7e-3)
     first_order = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
     lone, delayed = identified(mode, runs), identified(late, runs)
-    fast = [identify(record_once(s, StepTest(rise=0.0), period=1e-4)) for s in seeds(3)]
+    fast = [identify(record_once(s, StepTest(rise=0.0), period=1e-4)).calibration for s in seeds(3)]
     frequency, damping = mode_errors(lone, mode, 0)
     pair, pair_damping = mode_errors(fast, Plant().dynamics, 0)
     off = [c.dynamics.low_frequency_delay - late.delay for c in delayed]
@@ -295,7 +295,9 @@ def seeds(runs: int) -> range:
 
 def identified(truth: TransferFunction, runs: int, order: int = 0) -> list[Calibration]:
     """Of one recording a seed."""
-    return [identify(record_once(s, plant=Plant(truth)), order=order) for s in seeds(runs)]
+    return [
+        identify(record_once(s, plant=Plant(truth)), order=order).calibration for s in seeds(runs)
+    ]
 
 
 def speed() -> list[Row]:

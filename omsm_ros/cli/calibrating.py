@@ -41,16 +41,14 @@ def _declare_identify(sub: argparse.ArgumentParser) -> None:
 def _identify(args: argparse.Namespace) -> Facts:
     with progress_bar("reading", args.json) as progress:
         motion = motion_of_bag(args.bag, duration=args.duration, progress=progress)
-    calibration = identify(motion, order=args.order, input=args.input, settings=args.settings)
-    save_calibration(args.out, calibration)
-    facts = calibration_facts(calibration) | {"calibration": str(args.out)}
+    identified = identify(motion, order=args.order, input=args.input, settings=args.settings)
+    save_calibration(args.out, identified.calibration)
+    facts = calibration_facts(identified.calibration) | {"calibration": str(args.out)}
     if args.report is not None:
         # Drawing takes a second to import; most commands do without.
         from omsm_ros.jobs.certify import write_certificate
 
-        page = write_certificate(
-            args.report, calibration, motion, input=args.input, source=args.bag.name
-        )
+        page = write_certificate(args.report, identified, source=args.bag.name)
         facts["report"] = str(page)
     return facts
 

@@ -6,9 +6,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from omsm_ros import __version__
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.identification.explained import explain
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.identification.fitted_record import fitted_record
+from omsm_ros.core.identification.identify import Identification
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
 from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
 from omsm_ros.storage.files import whole_file
@@ -16,26 +15,18 @@ from omsm_ros.storage.files import whole_file
 PAGE, MARKDOWN = "certificate.html", "certificate.md"
 
 
-def write_certificate(
-    out: Path,
-    calibration: Calibration,
-    record: MotionRecord | None = None,
-    *,
-    input: str = "encoder",
-    source: str = "",
-) -> Path:
+def write_certificate(out: Path, identified: Identification, *, source: str = "") -> Path:
     """Write certificate.html, certificate.md and its plots into ``out``; return the page's path.
 
-    record: what the calibration was identified from, for the figures that show data
-    input: as it was given to the identification;  source: name of the recording
+    source: name of the recording, for a reader
     """
-    explained = None if record is None else explain(record, calibration, input)
+    calibration = identified.calibration
     certificate = CertificatePage(
         calibration,
         datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         source,
         __version__,
-        certificate_figures_of(calibration, explained),
+        certificate_figures_of(calibration, fitted_record(identified)),
     )
     files = {picture_name(name): picture for name, picture in certificate.figures.items()}
     files[MARKDOWN] = render_markdown(certificate).encode("utf-8", "replace")

@@ -10,7 +10,7 @@ from omsm_msgs.srv import Identify
 from rclpy.node import Node
 
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
-from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.identification.identify import Identification, identify
 from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.errors import OmsmError
@@ -79,13 +79,13 @@ class CalibratorNode(Node):
         self, request: Identify.Request, response: Identify.Response
     ) -> Identify.Response:
         try:
-            motion = self._motion(request)
-            calibration = self._identify(request, motion)
+            identified = self._identify(request)
+            calibration = identified.calibration
             response.calibration = conversions.calibration_message(
                 self._messages, calibration, self.get_clock().now().nanoseconds
             )
             response.success, self._last = self._judge(calibration)
-            self._last += self._certified(request, motion, calibration)
+            self._last += self._certified(request, identified)
         except (OmsmError, OSError) as err:
             response.success, self._last = False, f"identification failed: {err}"
         if response.success:
@@ -104,9 +104,7 @@ class CalibratorNode(Node):
         save_calibration(self._output, calibration)
         return True, f"{verdict}; {calibration.id[:12]} written to {self._output}"
 
-    def _certified(
-        self, request: Identify.Request, motion: MotionRecord, calibration: Calibration
-    ) -> str:
+    def _certified(self, request: Identify.Request, identified: Identification) -> str:
         """Write the certificate, if wanted, and say so; a full disk does not undo a calibration."""
         if not self._report_folder:
             return ""
@@ -116,18 +114,16 @@ class CalibratorNode(Node):
         try:
             page = write_certificate(
                 Path(self._report_folder),
-                calibration,
-                motion,
-                input=request.input or "encoder",
+                identified,
                 source=Path(request.bag).name or "live recording",
             )
         except (OmsmError, OSError) as err:
             return f"; no certificate: {err}"
         return f"; certificate in {page}"
 
-    def _identify(self, request: Identify.Request, motion: MotionRecord) -> Calibration:
+    def _identify(self, request: Identify.Request) -> Identification:
         return identify(
-            motion,
+            self._motion(request),
             order=request.order,
             input=request.input or "encoder",
             settings=self._settings,

@@ -8,6 +8,8 @@ import re
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.errors import FileError
 from omsm_ros.jobs.certify import MARKDOWN, PAGE, write_certificate
 from omsm_ros.storage import bags
@@ -51,18 +53,17 @@ def test_identify_speaks_of_the_certificate_to_people(capsys, bag, tmp_path):
     assert str(folder / PAGE) in capsys.readouterr().out
 
 
-def test_without_a_recording_there_are_no_figures_of_data(tmp_path, true_calibration):
-    page = write_certificate(tmp_path, true_calibration)
-    assert page == tmp_path / PAGE
-    assert {p.name for p in tmp_path.iterdir()} == {PAGE, MARKDOWN, "certificate_band.png"}
+@pytest.fixture(scope="module")
+def identified(step_test):
+    return identify(assemble([step_test.axes], [step_test.distance]), order=2)
 
 
-def test_text_that_has_no_bytes_is_replaced(tmp_path, true_calibration):
-    write_certificate(tmp_path, true_calibration, source="\ud800.mcap")
+def test_text_that_has_no_bytes_is_replaced(tmp_path, identified):
+    write_certificate(tmp_path, identified, source="\ud800.mcap")
     assert "?.mcap" in (tmp_path / PAGE).read_text(encoding="utf-8")
 
 
-def test_a_folder_that_is_a_file_is_one_clear_error(tmp_path, true_calibration):
+def test_a_folder_that_is_a_file_is_one_clear_error(tmp_path, identified):
     (tmp_path / "taken").write_text("")
     with pytest.raises(FileError, match="taken"):
-        write_certificate(tmp_path / "taken", true_calibration)
+        write_certificate(tmp_path / "taken", identified)

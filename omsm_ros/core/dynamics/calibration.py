@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, OmsmError
@@ -62,6 +63,11 @@ class Calibration:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise CalibrationError(f"{name} is {value!r}, expected a positive number")
+
+    @property
+    def low_frequency_delay_uncertainty(self) -> float:
+        """Standard uncertainty of the delay of slow motion [s]."""
+        return low_frequency_delay_uncertainty(self.dynamics, self.covariance)
 
     def content(self) -> dict[str, object]:
         """The calibration as JSON values, without its id."""

@@ -13,11 +13,8 @@ from omsm_ros.units import DEGREE_RAD
 
 # 95 % of a normal distribution.
 COVERAGE_FACTOR = 1.959964
-_MAX_NOISE_ORDER = 12
 # Octaves from one trial frequency to the next.
 _SHOWN_STEP = 1 / 24
-# Directions of the parameter space this much weaker than the strongest are lost in rounding.
-_RANK_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +55,22 @@ def response_band(
     variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
     gain, phase = np.sqrt(np.maximum(variance, 0.0))
     return Band(np.asarray(frequency, np.float64), gain, phase)
+
+
+def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> float:
+    """Return the standard uncertainty of the delay τ + d1 - n1/n0 of slow motion [s].
+
+    covariance: (p, p), order numerator, denominator[1:], delay
+    """
+    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
+    gradient = np.zeros(zeros + poles + 2)
+    gradient[-1] = 1.0
+    if zeros:
+        gradient[0] = dynamics.numerator[1] / dynamics.numerator[0] ** 2
+        gradient[1] = -1 / dynamics.numerator[0]
+    if poles:
+        gradient[zeros + 1] = 1.0
+    return float(np.sqrt(max(float(gradient @ covariance @ gradient), 0.0)))
 
 
 def widening(band: Band, other: Band, apart: ComplexArray) -> float:

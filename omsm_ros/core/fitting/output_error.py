@@ -132,6 +132,19 @@ class Problem:
         ]
         return np.concatenate(terms)
 
+    def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:
+        """Return ``values`` (k,) of the compared samples at their places, (n,)."""
+        grid = np.full(len(self.used), elsewhere)
+        grid[self.used] = values
+        return grid
+
+    def response(self, fitted: Fit) -> FloatArray:
+        """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""
+        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        terms = len(fitted.numerator)
+        spectrum = fitted.numerator @ self._driven(fitted.structure, lag)[:terms]
+        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.motion)])
+
     def output(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""
         lag, _ = fitted.scaled.lag(fitted.shape, self.s)

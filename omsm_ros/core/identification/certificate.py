@@ -2,96 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import chain
 
 import numpy as np
 
-from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.frequency_response import frequency_response
+from omsm_ros.core.dynamics.masses_and_springs import finite_values, shape
+from omsm_ros.core.dynamics.modes import modal_remainder, mode_entries
+from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.fitting.order_choice import Candidate
-from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.identification.residual_tests import response_agreement
+from omsm_ros.core.identification.static_gains import static_gains
+from omsm_ros.core.identification.two_masses import two_mass_entry
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import StepTestError
 
-# A residual this much larger than the noise is not noise; its square is χ² per sample.
-_WORST_CHI_SQUARE = 1.3
-# A rest this much noisier than the motion is no measure of noise: something still rings.
-_LEAST_CHI_SQUARE = 0.3
-_LEAST_TRUSTED_HZ = 5.0
-# 3 mdeg at 15 Hz, below anything a scan would notice.
-_HARMLESS_DELAY_S = 0.5e-6
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What the verdict rests on; SI units.
-
-    chi_square: mean square of the residual where the axis moves over that of the noise
-    noise: standard deviation of a reading, known or taken where the axis rests
-    whiteness, independence: p-values of the residual's tests
-    limits: of the 95 % band, within which the response is trusted up to ``valid_up_to``
-    delay_noise, delay_uncertainty: of the low-frequency delay, from noise alone and in all
-    gain_apart: standard uncertainty of the static gain, whatever lag and curvature G has
-    widened: factor on all uncertainties, for an order asked for that leaves things open
-    clearly_better: number of poles that the data ask for instead, or None
-    """
-
-    chi_square: float
-    residual_rms: float
-    noise: float
-    whiteness: float
-    independence: float
-    valid_up_to: float
-    limits: ResponseLimits
-    nyquist: float
-    delay_noise: float
-    delay_uncertainty: float
-    inter_sample_delay_bound: float
-    gain_apart: float
-    edges: int
-    widened: float = 1.0
-    clearly_better: int | None = None
+_AGREEMENT_SEGMENT_S = 1.0
+_LEAST_SEGMENTS = 8
+# Of the band up to half the sampling rate; the last line below it stands for the whole.
+_WHOLE_BAND = 0.999
 
 
-def certify(
-    dynamics: TransferFunction,
-    chosen: Candidate,
-    candidates: Sequence[Candidate],
-    vote: HankelVote,
-    evidence: Evidence,
-    further: Mapping[str, object],
+def certificate_of(
+    evidence: Evidence, findings: Sequence[Finding], table_mass: float | None
 ) -> dict[str, object]:
-    """A dict of JSON values, ending with ``reasons``, ``warnings`` and ``verdict``."""
-    structure = chosen.fit.structure
-    reasons, warnings = _reasons(evidence), _warnings(dynamics, evidence)
+    """Return a dict of JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
+
+    table_mass: moving mass of the table [kg], None if it is not known
+    """
+    nyquist = 0.5 / evidence.prepared.problem.period
+    limits = dict(chain.from_iterable(finding.limits.items() for finding in findings))
+    entries = dict(chain.from_iterable(finding.entries.items() for finding in findings))
+    reasons = list(chain.from_iterable(finding.reasons for finding in findings))
+    warnings = list(chain.from_iterable(finding.warnings for finding in findings))
     return {
-        "order": structure.poles,
-        "structure": _structure(chosen),
-        "singular_values": [float(v) for v in vote.singular_values],
-        "singular_value_order": vote.order,
-        "candidates": [
-            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms, "held_out_m": _number(c.held_out)}
-            for c in candidates
-        ],
-        "chi_square": evidence.chi_square,
-        "residual_rms_m": evidence.residual_rms,
-        "noise_m": evidence.noise,
-        "edges": evidence.edges,
-        "whiteness_p": evidence.whiteness,
-        "independence_p": evidence.independence,
-        "low_frequency_delay_s": dynamics.low_frequency_delay,
-        "low_frequency_delay_uncertainty_s": evidence.delay_uncertainty,
-        "inter_sample_delay_bound_s": evidence.inter_sample_delay_bound,
-        "limits": {
-            "gain": evidence.limits.gain,
-            "phase_rad": evidence.limits.phase,
-            "chi_square_least": _LEAST_CHI_SQUARE,
-            "chi_square_greatest": _WORST_CHI_SQUARE,
-            "valid_up_to_least_hz": _LEAST_TRUSTED_HZ,
-        },
-        **further,
+        **_order_entries(evidence.model),
+        **_residual_entries(evidence),
+        **_response_entries(evidence),
+        **_gain_entries(evidence),
+        "two_mass": two_mass_entry(
+            evidence.dynamics, evidence.known.covariance, evidence.known.valid_up_to, table_mass
+        ),
+        **entries,
+        "limits": limits,
         "warnings": warnings,
         "reasons": reasons,
-        "verdict": _verdict(reasons, evidence),
+        "verdict": verdict(reasons, evidence.known.valid_up_to, nyquist),
+    }
+
+
+def verdict(reasons: Sequence[str], valid_up_to: float, nyquist: float) -> str:
+    """Return "rejected", "accepted", or "accepted up to" a frequency [Hz] below ``nyquist``."""
+    if reasons:
+        return "rejected"
+    if valid_up_to < _WHOLE_BAND * nyquist:
+        return f"accepted up to {valid_up_to:.0f} Hz"
+    return "accepted"
+
+
+def _order_entries(model: Model) -> dict[str, object]:
+    return {
+        "order": model.chosen.fit.structure.poles,
+        "structure": _structure(model.chosen),
+        "singular_values": [float(v) for v in model.vote.singular_values],
+        "singular_value_order": model.vote.order,
+        "candidates": [
+            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms, "held_out_m": _number(c.held_out)}
+            for c in model.candidates
+        ],
     }
 
 
@@ -104,62 +88,62 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _reasons(evidence: Evidence) -> list[str]:
-    reasons = []
-    if evidence.chi_square > _WORST_CHI_SQUARE:
-        reasons.append(
-            f"where the axis moves the residual is {evidence.chi_square:.2f} times the noise of "
-            f"{evidence.noise * 1e9:.3g} nm squared: the model misses something; "
-            + _what_to_check(evidence)
-        )
-    if evidence.chi_square < _LEAST_CHI_SQUARE:
-        reasons.append(
-            f"where the axis moves the residual is only {evidence.chi_square:.2g} times the noise "
-            f"of {evidence.noise * 1e9:.3g} nm squared: the probe is not quiet where the axis "
-            "rests, or the stated noise is too large; start the recording after a second of rest"
-        )
-    if COVERAGE_FACTOR * evidence.gain_apart > evidence.limits.gain:
-        reasons.append(
-            "the motion does not tell the static gain from the dynamics (its gain alone is "
-            f"uncertain by {100 * COVERAGE_FACTOR * evidence.gain_apart:.2g} %): move in steps, or "
-            "at several frequencies at once"
-        )
-    if evidence.valid_up_to < _LEAST_TRUSTED_HZ:
-        reasons.append(
-            f"the response is known within limits only up to {evidence.valid_up_to:.2g} Hz; "
-            "make more or larger steps"
-        )
-    if evidence.inter_sample_delay_bound > max(evidence.delay_noise, _HARMLESS_DELAY_S):
-        reasons.append(
-            "motion between samples may shift the lag by "
-            f"{evidence.inter_sample_delay_bound * 1e6:.1f} µs: the edges are too sharp for the "
-            "sampling; use jerk-limited or dithered edges, or sample faster"
-        )
-    return reasons
+def _residual_entries(evidence: Evidence) -> dict[str, object]:
+    prepared, tests = evidence.prepared, evidence.residual
+    compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
+    return {
+        "residual_rms_m": evidence.fit.rms,
+        "edges": len(prepared.steps.edges),
+        "whiteness_p": tests.whiteness,
+        "independence_p": tests.independence,
+        "nonparametric_agreement": _agreement(
+            prepared.problem, evidence.fit, evidence.known.valid_up_to
+        ),
+        "samples": dict(evidence.record.counts) | compared,
+    }
 
 
-def _what_to_check(evidence: Evidence) -> str:
-    if evidence.clearly_better is not None:
-        return f"the order asked for is wrong, {evidence.clearly_better} poles tell far more"
-    return "check for backlash, a loose mount or a clipped probe"
+def _response_entries(evidence: Evidence) -> dict[str, object]:
+    dynamics, known = evidence.dynamics, evidence.known
+    return {
+        "low_frequency_delay_s": dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty_s": low_frequency_delay_uncertainty(
+            dynamics, known.covariance
+        ),
+        "shown_up_to_hz": known.shown_up_to,
+        "shape": finite_values(shape(dynamics, 0.5 / evidence.prepared.problem.period)),
+        "modes": mode_entries(dynamics, known.covariance),
+        "modal_remainder": modal_remainder(dynamics, known.valid_up_to),
+    }
 
 
-def _warnings(dynamics: TransferFunction, evidence: Evidence) -> list[str]:
-    widened = [
-        f"order {len(dynamics.denominator) - 1} was asked for; without asking, more stays open "
-        f"than it can state: its uncertainties are taken {evidence.widened:.2g} times as large"
-    ]
-    return widened[: evidence.widened > 1] + [
-        f"pole at {mode.frequency:.0f} Hz lies beyond {evidence.valid_up_to:.0f} Hz, "
-        "up to which the response is known within limits: it need not be a resonance"
-        for mode in dynamics.modes()
-        if mode.frequency > evidence.valid_up_to
-    ]
+def _gain_entries(evidence: Evidence) -> dict[str, object]:
+    """What is seen beside the response: gain, drift, backlash."""
+    best, column = evidence.fit, evidence.prepared.backlash_column
+    duration = len(evidence.record) * evidence.record.sample_period
+    return {
+        "static_gain": abs(best.gain),
+        "static_gain_uncertainty": float(np.sqrt(evidence.known.gain_variance)),
+        "static_gains": _attributed(evidence.record),
+        "polarity": -int(np.sign(best.gain)),
+        "drift_m_s": 2 * float(best.background[1]) / duration,
+        "backlash_m": 0.0 if column is None else 2 * abs(float(best.background[column])),
+    }
 
 
-def _verdict(reasons: list[str], evidence: Evidence) -> str:
-    if reasons:
-        return "rejected"
-    if evidence.valid_up_to < 0.999 * evidence.nyquist:
-        return f"accepted up to {evidence.valid_up_to:.0f} Hz"
-    return "accepted"
+def _attributed(record: MotionRecord) -> dict[str, object] | None:
+    """Gains between probe, encoder and reference; None where there are too few plateaus."""
+    try:
+        return asdict(static_gains(record))
+    except StepTestError:
+        return None
+
+
+def _agreement(problem: Problem, best: Fit, up_to: float) -> float | None:
+    residual = problem.on_grid(best.residual, 0.0)
+    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
+    segment = max(segment, 16)
+    value = response_agreement(
+        frequency_response(problem.motion, residual, problem.period, segment), up_to
+    )
+    return value if np.isfinite(value) else None

@@ -74,7 +74,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
     p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
-    sigma = np.sqrt(covariance[_LINES, _LINES]) / (2 * np.pi * lines[0])
+    sigma = math.hypot(*(c.low_frequency_delay_uncertainty for c in (old, new)))
     worst = int(np.argmax(np.abs(ratio)))
     return Change(
         delay=float(delay),

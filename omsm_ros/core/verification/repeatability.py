@@ -90,7 +90,7 @@ def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
     deviation, stated = np.std(off, axis=0, ddof=1), np.sqrt(np.diag(covariance))
     delay = _spread(
         [c.dynamics.low_frequency_delay for c in calibrations],
-        [_delay_uncertainty(c, lines) for c in calibrations],
+        [c.low_frequency_delay_uncertainty for c in calibrations],
     )
     static_gain = _spread(
         [c.static_gain for c in calibrations],
@@ -118,13 +118,6 @@ def _spread(values: Sequence[float], uncertainties: Sequence[float]) -> Spread:
         float(np.std(values, ddof=1)),
         float(np.sqrt(np.mean(np.square(uncertainties)))),
     )
-
-
-def _delay_uncertainty(calibration: Calibration, lines: FloatArray) -> float:
-    """[s], read off the phase at the lowest line, as a lag well below every pole is one."""
-    k = len(lines)
-    variance = response_covariance(calibration, lines)[k, k]
-    return float(np.sqrt(variance) / (2 * np.pi * lines[0]))
 
 
 def _chance(off: FloatArray, covariance: FloatArray, static_gain: Spread) -> float:

@@ -84,7 +84,7 @@ def sideways_lag(
     if not spread < _MAX_UNCERTAINTY_S:
         raise DataError(_NO_SLOPE)
     of_z = calibration.dynamics.low_frequency_delay
-    uncertainty = float(np.hypot(spread, delay_uncertainty(calibration)))
+    uncertainty = float(np.hypot(spread, calibration.low_frequency_delay_uncertainty))
     return SidewaysLag(
         lag=lag,
         uncertainty=uncertainty,
@@ -98,21 +98,6 @@ _NO_SLOPE = (
     "the surface does not change along the path, so a lag leaves no trace; scan a surface "
     "that is not symmetric about the spindle"
 )
-
-
-def delay_uncertainty(calibration: Calibration) -> float:
-    """Standard uncertainty of the low-frequency delay τ + d1 - n1/n0 of G [s]."""
-    g = calibration.dynamics
-    m, n = len(g.numerator) - 1, len(g.denominator) - 1
-    gradient = np.zeros(m + n + 2)
-    gradient[-1] = 1.0
-    if m:
-        gradient[0] = g.numerator[1] / g.numerator[0] ** 2
-        gradient[1] = -1 / g.numerator[0]
-    if n:
-        gradient[m + 1] = 1.0
-    variance = float(gradient @ calibration.covariance @ gradient)
-    return float(np.sqrt(max(variance, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR
-from omsm_ros.core.identification.explained import (
+from omsm_ros.core.identification.fitted_record import (
     EdgeMean,
-    Explained,
+    FittedRecord,
     autocorrelation,
     mean_at_edges,
 )
@@ -92,24 +92,24 @@ def thinned(seen: FrequencyResponse) -> FrequencyResponse:
     )
 
 
-def residual(explained: Explained, noise: float | None) -> Figure:
+def residual(fitted: FittedRecord, noise: float | None) -> Figure:
     """What the model leaves: over the recording, at the mean edge, and its correlation.
 
     noise: standard deviation of a reading [m], for comparison, or None
     """
-    at_edges = mean_at_edges(explained, _BEFORE_EDGE_S, _AFTER_EDGE_S)
+    at_edges = mean_at_edges(fitted, _BEFORE_EDGE_S, _AFTER_EDGE_S)
     made, axes = style.figure(6.1, 5.6, rows=2 + (at_edges is not None))
-    _draw_over_time(axes[0, 0], explained, noise)
+    _draw_over_time(axes[0, 0], fitted, noise)
     if at_edges is not None:
         _draw_at_edges(axes[1, 0], at_edges, noise)
-    _draw_correlation(axes[-1, 0], explained.residual)
+    _draw_correlation(axes[-1, 0], fitted.residual)
     made.align_ylabels()
     return made
 
 
-def _draw_over_time(axes: Axes, explained: Explained, noise: float | None) -> None:
-    known = np.isfinite(explained.residual)
-    at, low, high = style.envelope(explained.time[known], explained.residual[known] / NANOMETRE_M)
+def _draw_over_time(axes: Axes, fitted: FittedRecord, noise: float | None) -> None:
+    known = np.isfinite(fitted.residual)
+    at, low, high = style.envelope(fitted.time[known], fitted.residual[known] / NANOMETRE_M)
     axes.fill_between(at, low, high, color=style.AFTER, linewidth=0.5)
     if noise is not None:
         for sign in (-1, 1):

@@ -11,7 +11,7 @@ import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
-from omsm_ros.core.identification.explained import Explained
+from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.certificate import figures as certificate_figures
@@ -79,19 +79,14 @@ class Section:
     note: str = ""
 
 
-def certificate_figures_of(
-    calibration: Calibration, explained: Explained | None = None
-) -> dict[str, bytes]:
-    """PNG files for the page; those that show data only where there are data."""
+def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
+    """PNG files for the page."""
     certificate = calibration.certificate
-    seen = explained.measured if explained is not None else None
-    made = {BAND: certificate_figures.response_with_band(calibration, seen)}
-    if explained is not None:
-        noise = number(certificate.get("noise_m"))
-        made["step"] = step_response(
-            explained.time, explained.carriage, _bridged(explained), explained.modelled
-        )
-        made["residual"] = certificate_figures.residual(explained, noise)
+    made = {
+        BAND: certificate_figures.response_with_band(calibration, fitted.measured),
+        "step": step_response(fitted.time, fitted.input, _bridged(fitted), fitted.modelled),
+        "residual": certificate_figures.residual(fitted, number(certificate.get("noise_m"))),
+    }
     candidates = [c for c in tables.listed(certificate, "candidates") if _comparable(c)]
     values = tables.numbers(certificate, "singular_values")
     if values or candidates:
@@ -106,9 +101,9 @@ def _comparable(candidate: Mapping[str, object]) -> bool:
     return counted and all(number(candidate.get(key)) is not None for key in ("rms_m", "bic"))
 
 
-def _bridged(explained: Explained) -> FloatArray:
+def _bridged(fitted: FittedRecord) -> FloatArray:
     """Matplotlib leaves gaps at NaN by itself; the median that aligns an edge does not."""
-    return np.asarray(np.where(np.isfinite(explained.seen), explained.seen, explained.modelled))
+    return np.asarray(np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled))
 
 
 def render(certificate: CertificatePage) -> str:

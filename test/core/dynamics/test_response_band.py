@@ -10,6 +10,7 @@ from omsm_ros.core.dynamics.response_band import (
     COVERAGE_FACTOR,
     Band,
     ResponseLimits,
+    low_frequency_delay_uncertainty,
     relative_response_jacobian,
     response_band,
     shown_up_to,
@@ -209,3 +210,21 @@ def test_without_motion_nothing_is_shown():
     assert (
         shown_up_to(np.arange(10.0), np.zeros(10, complex), np.zeros(10), ResponseLimits()) == 0.0
     )
+
+
+def test_uncertainty_of_the_low_frequency_delay_follows_by_perturbation():
+    rng = np.random.default_rng(5)
+    g = TransferFunction.from_ascending([1.27, 2e-4, 1e-8], [1.27, 8e-4, 6e-8, 1e-12])
+    values = np.concatenate([g.numerator, g.denominator[1:], [1e-4]])
+    mixing = rng.normal(size=(7, 7))
+    covariance = 1e-12 * np.outer(values, values) * (mixing @ mixing.T)
+    draws = values + rng.multivariate_normal(np.zeros(7), mixing @ mixing.T, 4000) * 1e-6 * values
+    delays = [TransferFunction(d[:3], np.r_[1.0, d[3:6]], d[6]).low_frequency_delay for d in draws]
+    stated = low_frequency_delay_uncertainty(g, covariance)
+    assert stated == pytest.approx(np.std(delays), rel=0.05)
+
+
+def test_a_pure_delay_is_as_uncertain_as_it_is_stated():
+    covariance = np.diag([0.0, 4e-12])
+    pure = TransferFunction([1.0], [1.0], 1e-4)
+    assert low_frequency_delay_uncertainty(pure, covariance) == pytest.approx(2e-6)

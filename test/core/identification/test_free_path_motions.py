@@ -25,7 +25,7 @@ def identified(motion, plant, part, seed):
     whole = assemble([made.axes], [made.distance])
     return identify(
         MotionRecord.from_arrays(whole.sample_period, whole.z[part], whole.distance[part])
-    )
+    ).calibration
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_too_little_left_between_the_ends_is_said(lost):
 def refusal(record):
     """Why nothing was identified."""
     try:
-        certificate = identify(record).certificate
+        certificate = identify(record).calibration.certificate
     except IdentificationError as error:
         return str(error)
     return certificate["reasons"][0]

@@ -27,7 +27,7 @@ STEPS, EQ_12 = StepTest(), Plant().dynamics
 def identified(truth, seed, order=0, motion=STEPS, period=1e-3, encoder_noise=4e-10):
     cell = Cell(plant=Plant(truth), seed=seed, sample_period=period, encoder_noise=encoder_noise)
     made = record(cell, motion, Flat(), stand_off=-49e-6)
-    return identify(assemble([made.axes], [made.distance]), order=order)
+    return identify(assemble([made.axes], [made.distance]), order=order).calibration
 
 
 def off(calibration, truth, index):

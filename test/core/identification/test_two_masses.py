@@ -25,7 +25,7 @@ def calibrated(collocated, mass):
     dynamics = MACHINE.collocated() if collocated else MACHINE.non_collocated()
     recording = record(Cell(plant=Plant(dynamics)), StepTest(), Flat(), stand_off=-49e-6)
     settings = {} if mass is None else {"table_mass_kg": mass}
-    return identify(assemble([recording.axes], [recording.distance]), settings=settings)
+    return identify(assemble([recording.axes], [recording.distance]), settings=settings).calibration
 
 
 @pytest.mark.parametrize("collocated", [False, True])
@@ -85,7 +85,7 @@ def test_masses_do_not_explain_a_latency():
     chain = MACHINE.non_collocated()
     late = TransferFunction(chain.numerator, chain.denominator, 5e-4)
     recording = record(Cell(plant=Plant(late)), StepTest(), Flat(), stand_off=-49e-6)
-    found = identify(assemble([recording.axes], [recording.distance]))
+    found = identify(assemble([recording.axes], [recording.distance])).calibration
     assert found.certificate["verdict"] != "rejected"
     assert found.certificate["two_mass"] is None
 

@@ -24,7 +24,7 @@ def calibrated(seed, later=0.0, count=10):
     recording = record(
         Cell(plant=plant, seed=seed), StepTest(count=count), Flat(), stand_off=-4.9e-6 * count
     )
-    return identify(assemble([recording.axes], [recording.distance]))
+    return identify(assemble([recording.axes], [recording.distance])).calibration
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])

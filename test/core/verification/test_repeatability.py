@@ -28,7 +28,7 @@ def calibrated(seed, later=0.0):
     recording = record(
         Cell(plant=plant, seed=seed), StepTest(count=5), Flat(), stand_off=-4.9e-6 * 5
     )
-    return identify(assemble([recording.axes], [recording.distance]))
+    return identify(assemble([recording.axes], [recording.distance])).calibration
 
 
 def drawn(seed, count=COUNT, scale=1.0):

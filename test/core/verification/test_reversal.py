@@ -14,7 +14,7 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
-from omsm_ros.core.verification.reversal import delay_uncertainty, sideways_lag
+from omsm_ros.core.verification.reversal import sideways_lag
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
@@ -136,15 +136,3 @@ def test_a_surface_of_revolution_tells_nothing_about_a_lag() -> None:
     pair = [scan(s, 1, LATE, LATE_CELL, bowl) for s in (30.0, -30.0)]
     found = sideways_lag(pair, LATE)
     assert found.uncertainty > 10e-6
-
-
-def test_low_frequency_delay_uncertainty_follows_by_perturbation() -> None:
-    rng = np.random.default_rng(5)
-    g = Plant().dynamics
-    values = np.concatenate([g.numerator, g.denominator[1:], [1e-4]])
-    mixing = rng.normal(size=(7, 7))
-    covariance = 1e-12 * np.outer(values, values) * (mixing @ mixing.T)
-    known = replace(MECHANICAL, covariance=covariance)
-    draws = values + rng.multivariate_normal(np.zeros(7), mixing @ mixing.T, 4000) * 1e-6 * values
-    delays = [TransferFunction(d[:3], np.r_[1.0, d[3:6]], d[6]).low_frequency_delay for d in draws]
-    assert delay_uncertainty(known) == pytest.approx(np.std(delays), rel=0.05)

@@ -13,7 +13,7 @@ import pytest
 
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.identification.explained import explain
+from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.errors import ConfigurationError
@@ -66,18 +66,23 @@ def record(step_test):
 
 
 @pytest.fixture(scope="module")
-def calibration(record):
+def identified(record):
     return identify(record, order=2, settings={"fixture": "plate <3>"})
 
 
 @pytest.fixture(scope="module")
-def explained(record, calibration):
-    return explain(record, calibration)
+def calibration(identified):
+    return identified.calibration
 
 
 @pytest.fixture(scope="module")
-def figures(calibration, explained):
-    return certificate_figures_of(calibration, explained)
+def fitted(identified):
+    return fitted_record(identified)
+
+
+@pytest.fixture(scope="module")
+def figures(calibration, fitted):
+    return certificate_figures_of(calibration, fitted)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +199,8 @@ class TestOlderCertificates:
                 render_markdown(bare(altered))
 
     def test_the_response_is_drawn_from_the_coefficients_alone(self, older):
-        assert set(certificate_figures_of(older)) == {"band"}
+        gain, *_ = certificate_figures.response_with_band(older).get_axes()
+        assert [line for line in gain.get_lines() if line.get_label() == "identified"]
 
     def test_a_model_without_dynamics(self, calibration):
         still = replace(
@@ -202,11 +208,9 @@ class TestOlderCertificates:
             dynamics=TransferFunction([1.0], [1.0], 1e-4),
             covariance=np.zeros((2, 2)),
         )
-        figures = certificate_figures_of(still)
-        assert (
-            "0 poles, 0 zeros, delay"
-            in Page(render(CertificatePage(still, "today", figures=figures))).text
-        )
+        figures = {"band": style.png(certificate_figures.response_with_band(still))}
+        certificate = CertificatePage(still, "today", figures=figures)
+        assert "0 poles, 0 zeros, delay" in Page(render(certificate)).text
 
 
 class TestVerdict:
@@ -385,8 +389,8 @@ class TestMarkdown:
 
 
 class TestFigures:
-    def test_the_band_carries_the_estimate_without_a_model(self, calibration, explained):
-        made = certificate_figures.response_with_band(calibration, explained.measured)
+    def test_the_band_carries_the_estimate_without_a_model(self, calibration, fitted):
+        made = certificate_figures.response_with_band(calibration, fitted.measured)
         gain = made.get_axes()[0]
         labels = {text.get_text() for text in gain.get_legend().get_texts()}
         assert labels == {"95 % band", "identified", "without a model, 95 %"}
@@ -428,11 +432,11 @@ class TestFigures:
         assert np.mean(pulls**2) / 2 == pytest.approx(1.0, abs=0.5)
         assert thin.uncertainty[-1] < 0.05 / 3
 
-    def test_the_mean_edge_is_missing_without_edges(self, explained):
+    def test_the_mean_edge_is_missing_without_edges(self, fitted):
         def rows(shown):
             return len(certificate_figures.residual(shown, 10e-9).get_axes())
 
-        assert (rows(explained), rows(replace(explained, edges=()))) == (3, 2)
+        assert (rows(fitted), rows(replace(fitted, edges=()))) == (3, 2)
 
     def test_states_and_noise_are_told_apart(self, calibration):
         made = certificate_figures.order([60.0, 3.0, 0.9, 0.0], [], None)

@@ -1,0 +1,117 @@
+"""May this calibration be used? One check for each way in which it may be wrong.
+
+A check turns numbers into a :class:`Finding`. To add one, write a function and append what
+calls it to :data:`CHECKS`; its entries, limits, reasons and warnings then stand in the
+certificate, and any reason rejects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.covariance import gain_apart
+from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.finding import Finding
+
+# A residual this much larger than the noise is not noise; its square is χ² per sample.
+_WORST_CHI_SQUARE = 1.3
+# A rest this much noisier than the motion is no measure of noise: something still rings.
+_LEAST_CHI_SQUARE = 0.3
+_LEAST_TRUSTED_HZ = 5.0
+
+
+def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Finding:
+    """Compare the mean square of the residual where the axis moves with that of the noise.
+
+    chi_square: their ratio [1];  noise: standard deviation of a reading [m]
+    clearly_better: number of poles that the data ask for instead of the order given, or None
+    """
+    reasons = []
+    if chi_square > _WORST_CHI_SQUARE:
+        reasons.append(
+            f"where the axis moves the residual is {chi_square:.2f} times the noise of "
+            f"{noise * 1e9:.3g} nm squared: the model misses something; "
+            + _what_to_check(clearly_better)
+        )
+    if chi_square < _LEAST_CHI_SQUARE:
+        reasons.append(
+            f"where the axis moves the residual is only {chi_square:.2g} times the noise "
+            f"of {noise * 1e9:.3g} nm squared: the probe is not quiet where the axis "
+            "rests, or the stated noise is too large; start the recording after a second of rest"
+        )
+    limits = {"chi_square_least": _LEAST_CHI_SQUARE, "chi_square_greatest": _WORST_CHI_SQUARE}
+    return Finding({"chi_square": chi_square, "noise_m": noise}, limits, tuple(reasons))
+
+
+def _what_to_check(clearly_better: int | None) -> str:
+    if clearly_better is not None:
+        return f"the order asked for is wrong, {clearly_better} poles tell far more"
+    return "check for backlash, a loose mount or a clipped probe"
+
+
+def separable_gain(uncertainty: float, limit: float) -> Finding:
+    """Reject a motion that does not separate the static gain from the dynamics.
+
+    uncertainty: standard, of the static gain whatever lag and curvature G has, relative
+    limit: of the 95 % band of the gain, relative
+    """
+    if COVERAGE_FACTOR * uncertainty <= limit:
+        return Finding()
+    return Finding(
+        reasons=(
+            "the motion does not tell the static gain from the dynamics (its gain alone is "
+            f"uncertain by {100 * COVERAGE_FACTOR * uncertainty:.2g} %): move in steps, or "
+            "at several frequencies at once",
+        )
+    )
+
+
+def trusted_range(valid_up_to: float, limits: ResponseLimits) -> Finding:
+    """Reject a response that is not known within ``limits`` up to a few hertz."""
+    allowed = {
+        "gain": limits.gain,
+        "phase_rad": limits.phase,
+        "valid_up_to_least_hz": _LEAST_TRUSTED_HZ,
+    }
+    reasons: tuple[str, ...] = ()
+    if valid_up_to < _LEAST_TRUSTED_HZ:
+        reasons = (
+            f"the response is known within limits only up to {valid_up_to:.2g} Hz; "
+            "make more or larger steps",
+        )
+    return Finding(limits=allowed, reasons=reasons)
+
+
+def requested_order(order: int, factor: float) -> Finding:
+    """Warn of uncertainties that were taken ``factor`` times as large, see ``no_surer``."""
+    if factor <= 1:
+        return Finding()
+    return Finding(
+        warnings=(
+            f"order {order} was asked for; without asking, more stays open than it can state: "
+            f"its uncertainties are taken {factor:.2g} times as large",
+        )
+    )
+
+
+def poles_beyond(dynamics: TransferFunction, valid_up_to: float) -> Finding:
+    """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known."""
+    return Finding(
+        warnings=tuple(
+            f"pole at {mode.frequency:.0f} Hz lies beyond {valid_up_to:.0f} Hz, "
+            "up to which the response is known within limits: it need not be a resonance"
+            for mode in dynamics.modes()
+            if mode.frequency > valid_up_to
+        )
+    )
+
+
+CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
+    lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
+    lambda e: separable_gain(gain_apart(e.prepared.problem, e.fit), e.limits.gain),
+    lambda e: trusted_range(e.known.valid_up_to, e.limits),
+    lambda e: requested_order(e.fit.structure.poles, e.known.widened),
+    lambda e: poles_beyond(e.dynamics, e.known.valid_up_to),
+)

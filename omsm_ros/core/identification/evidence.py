@@ -1,0 +1,46 @@
+"""Everything that the checks of an identification may look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from omsm_ros.core.dynamics.response_band import ResponseLimits
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.output_error import Fit
+from omsm_ros.core.fitting.preparation import Prepared
+from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.identification.residual_tests import ResidualTests, residual_tests
+from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
+from omsm_ros.core.samples.motion_record import MotionRecord
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The record, the problem fitted, the chosen model, and how well it is known.
+
+    limits: of the 95 % band, within which the response is trusted
+    noise: known standard deviation of one reading of the probe [m], or None
+    """
+
+    record: MotionRecord
+    prepared: Prepared
+    model: Model
+    known: ResponseUncertainty
+    limits: ResponseLimits
+    noise: float | None = None
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that is certified."""
+        return self.model.chosen.fit
+
+    @property
+    def dynamics(self) -> TransferFunction:
+        """G(s) with G(0) = 1."""
+        return self.fit.dynamics
+
+    @cached_property
+    def residual(self) -> ResidualTests:
+        """Tests of the residual."""
+        return residual_tests(self.prepared.problem, self.fit, self.prepared.steps, self.noise)

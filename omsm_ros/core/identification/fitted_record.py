@@ -1,0 +1,127 @@
+"""A recording beside the fit that was certified: what a certificate draws of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.dynamics.frequency_response import FrequencyResponse, frequency_response
+from omsm_ros.core.fitting.output_error import Problem
+from omsm_ros.core.fitting.steps import Edge
+from omsm_ros.core.identification.identify import Identification
+from omsm_ros.core.samples.blocks import FloatArray
+
+# Resolves 1 Hz; a step test has a few edges in each segment.
+_SEGMENT_S = 1.0
+_LEAST_SEGMENT = 16
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedRecord:
+    """Input, output and model on the recording's grid, each array of shape (n,).
+
+    input: motion of the axis about its mean [m]
+    output: the same motion as the probe saw it: its reading over the static gain, without
+        offset, drift, backlash and initial-condition response [m]; NaN where nothing is compared
+    modelled: input through G_m [m]
+    residual: of the probe's reading [m], the one that the certificate speaks of; NaN where
+        nothing is compared
+    edges: moves from rest to rest
+    measured: response of ``output`` to ``input`` without a model, or None if too short
+    """
+
+    sample_period: float
+    input: FloatArray
+    output: FloatArray
+    modelled: FloatArray
+    residual: FloatArray
+    edges: Sequence[Edge]
+    measured: FrequencyResponse | None
+
+    @property
+    def time(self) -> FloatArray:
+        """Since the first sample [s]."""
+        return np.asarray(self.sample_period * np.arange(len(self.input)), np.float64)
+
+
+def fitted_record(identified: Identification) -> FittedRecord:
+    """Return the recording of ``identified`` beside its fit; nothing is fitted again."""
+    problem, fit = identified.prepared.problem, identified.fit
+    modelled = problem.response(fit)
+    residual = problem.on_grid(fit.residual, np.nan)
+    return FittedRecord(
+        sample_period=problem.period,
+        input=problem.motion,
+        output=np.asarray(modelled + residual / fit.gain, np.float64),
+        modelled=modelled,
+        residual=residual,
+        edges=identified.prepared.steps.edges,
+        measured=_measured(problem, modelled, residual / fit.gain),
+    )
+
+
+def _measured(
+    problem: Problem, modelled: FloatArray, missed: FloatArray
+) -> FrequencyResponse | None:
+    segment = round(_SEGMENT_S / problem.period)
+    if not _LEAST_SEGMENT <= segment <= len(missed) // 2:
+        return None
+    output = modelled + np.where(np.isfinite(missed), missed, 0.0)
+    return frequency_response(problem.motion, output, problem.period, segment)
+
+
+def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
+    """Correlation of ``residual`` (n,), NaN left out, with itself 1 to ``lags`` samples later."""
+    known = np.isfinite(residual)
+    values = np.where(known, residual, 0.0)
+    power = float(np.sum(values**2)) / max(int(np.sum(known)), 1)
+    if power == 0:
+        return np.zeros(lags)
+    return np.asarray(
+        [
+            float(values[lag:] @ values[:-lag])
+            / (max(int(np.sum(known[lag:] & known[:-lag])), 1) * power)
+            for lag in range(1, lags + 1)
+        ]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeMean:
+    """Output less model, all edges on top of each other, downward ones turned over.
+
+    time: since the middle of the edge [s];  mean: [m], both (k,);  edges: how many
+    """
+
+    time: FloatArray
+    mean: FloatArray
+    edges: int
+
+
+def mean_at_edges(fitted: FittedRecord, before: float, after: float) -> EdgeMean | None:
+    """Return the mean of output less model around the middle of an edge; None without edges.
+
+    before, after: how far to go on either side [s]
+    What the model misses at every edge stays, noise falls with the root of their number.
+    """
+    period, missed = fitted.sample_period, fitted.output - fitted.modelled
+    offsets = np.arange(-round(before / period), round(after / period) + 1)
+    found = []
+    for edge in fitted.edges:
+        index = _middle(fitted.input, edge) + offsets
+        if index[0] >= 0 and index[-1] < len(missed):
+            found.append(np.sign(edge.height) * missed[index])
+    if not found:
+        return None
+    stacked = np.asarray(found)
+    known = np.isfinite(stacked)
+    total = np.sum(np.where(known, stacked, 0.0), axis=0)
+    mean = np.asarray(total / np.maximum(np.sum(known, axis=0), 1), np.float64)
+    return EdgeMean(np.asarray(offsets * period, np.float64), mean, len(found))
+
+
+def _middle(motion: FloatArray, edge: Edge) -> int:
+    travelled = np.abs(motion[edge.start : edge.stop] - motion[edge.start])
+    return edge.start + int(np.argmax(travelled > 0.5 * abs(edge.height)))

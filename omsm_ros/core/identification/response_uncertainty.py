@@ -1,0 +1,152 @@
+"""How well is the response of a chosen model known, and up to which frequency is it trusted?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft, signal
+
+from omsm_ros.core.dynamics.response_band import (
+    Band,
+    ResponseLimits,
+    response_band,
+    shown_up_to,
+    trusted_up_to,
+    widening,
+)
+from omsm_ros.core.fitting.covariance import noise_spectrum, parameter_covariance
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.preparation import Prepared
+from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS
+from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.samples.blocks import FloatArray
+
+_FREQUENCIES = 400
+# Kass and Raftery: a difference in BIC above this is very strong evidence.
+_EQUALLY_GOOD_BIC = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseUncertainty:
+    """How well the chosen model is known.
+
+    covariance: (p, p) of the coefficients, all terms included
+    gain_variance: of the gain of the probe per travel at rest [1]
+    shown_up_to: [Hz] beyond which the motion would show no error of the response
+    valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
+    findings: of the terms of the covariance
+    widened: factor on the uncertainties, and clearly_better: number of poles, see no_surer
+    """
+
+    covariance: FloatArray
+    gain_variance: float
+    shown_up_to: float
+    valid_up_to: float
+    findings: Sequence[Finding] = ()
+    widened: float = 1.0
+    clearly_better: int | None = None
+
+
+def response_uncertainty(
+    prepared: Prepared, model: Model, limits: ResponseLimits
+) -> ResponseUncertainty:
+    """Return how well the chosen fit of ``model`` is known: noise, then each further term."""
+    problem, best = prepared.problem, model.chosen.fit
+    size, dynamics = best.structure.size, best.dynamics
+    passed = replace(dynamics, numerator=best.gain * dynamics.numerator)
+    every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
+    transform = best.scaled.coefficient_jacobian(best.shape)
+    from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
+    terms = [term(prepared, best, from_noise) for term in COVARIANCE_TERMS]
+    covariance = _symmetric(from_noise + np.sum([t.covariance for t in terms], axis=0))
+    shown = _shown_up_to(problem, best, limits)
+    band = response_band(dynamics, covariance, _frequencies(problem))
+    return ResponseUncertainty(
+        covariance=covariance,
+        gain_variance=float(every[size, size]),
+        shown_up_to=shown,
+        valid_up_to=_trusted_up_to(model, band, limits, shown),
+        findings=tuple(term.finding for term in terms),
+    )
+
+
+def no_surer(
+    known: ResponseUncertainty,
+    prepared: Prepared,
+    model: Model,
+    free: Model,
+    limits: ResponseLimits,
+) -> ResponseUncertainty:
+    """Return what is known of an order that was asked for, no surer than the ``free`` choice.
+
+    Too low an order has few parameters, so little noise in them, and a bias beyond what the
+    motion excites, which no residual shows. The free choice tells how much it leaves open.
+    """
+    mine, other = model.chosen.fit, free.chosen.fit
+    if mine.structure == other.structure or mine.structure.contains(other.structure):
+        return known
+    lines = _frequencies(prepared.problem)
+    trusted = lines[lines <= known.valid_up_to]
+    free_covariance = response_uncertainty(prepared, free, limits).covariance
+    factor = widening(
+        response_band(mine.dynamics, known.covariance, trusted),
+        response_band(other.dynamics, free_covariance, trusted),
+        np.log(other.dynamics.response(trusted) / mine.dynamics.response(trusted)),
+    )
+    covariance = factor**2 * known.covariance
+    band = response_band(mine.dynamics, covariance, lines)
+    better = free.chosen.bic < model.chosen.bic - _EQUALLY_GOOD_BIC
+    return replace(
+        known,
+        covariance=covariance,
+        valid_up_to=_trusted_up_to(model, band, limits, known.shown_up_to),
+        widened=factor,
+        clearly_better=other.structure.poles if better else None,
+    )
+
+
+def _trusted_up_to(model: Model, band: Band, limits: ResponseLimits, shown: float) -> float:
+    return min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
+
+
+def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
+    """Beyond this frequency [Hz] the data could not contradict the model ``best``."""
+    length = len(problem.used)
+    compared = np.flatnonzero(problem.used)
+    taper = np.zeros(length)
+    # From one end of what is compared to the other, so that no end breaks off.
+    taper[compared[0] : compared[-1] + 1] = signal.windows.hann(compared[-1] + 1 - compared[0])
+    answer = problem.output(best) - problem.background @ best.background
+    seen = best.samples / (compared[-1] + 1 - compared[0])
+    noise = noise_spectrum(best.residual, length) * float(taper @ taper) / seen
+    return shown_up_to(
+        np.asarray(fft.rfftfreq(length, problem.period)),
+        np.asarray(fft.rfft(taper * (answer - np.mean(answer))), np.complex128),
+        noise,
+        limits,
+    )
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def _frequencies(problem: Problem) -> FloatArray:
+    nyquist = 0.5 / problem.period
+    return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, _FREQUENCIES))
+
+
+def _disagreement(model: Model, band: Band) -> Band:
+    """Largest difference from any other candidate that describes the data about as well."""
+    chosen = model.chosen.fit.dynamics.response(band.frequency)
+    gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
+    best = min(c.bic for c in model.candidates)
+    for other in model.candidates:
+        if other.bic < best + _EQUALLY_GOOD_BIC:
+            difference = np.log(other.fit.dynamics.response(band.frequency) / chosen)
+            gain = np.maximum(gain, np.abs(difference.real))
+            phase = np.maximum(phase, np.abs(difference.imag))
+    return Band(band.frequency, gain, phase)

@@ -1,0 +1,87 @@
+"""Each check by numbers made up to be good or bad in one respect."""
+
+from itertools import chain
+
+import pytest
+
+from omsm_ros.core.dynamics.response_band import ResponseLimits
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.identification.checks import (
+    misfit,
+    poles_beyond,
+    requested_order,
+    separable_gain,
+    trusted_range,
+)
+from omsm_ros.core.identification.covariance_terms import hidden_motion_finding
+
+LIMITS = ResponseLimits(gain=0.01, phase=0.02)
+SLOW = TransferFunction.from_ascending([1.0], [1.0, 1e-2])
+FAST = TransferFunction.from_ascending([1.0], [1.0, 1e-4])
+
+
+def test_good_evidence_gives_no_reason_and_no_warning():
+    good = [
+        misfit(1.0, 1e-8, None),
+        separable_gain(1e-5, 0.01),
+        trusted_range(80.0, LIMITS),
+        requested_order(3, 1.0),
+        poles_beyond(SLOW, 80.0),
+        hidden_motion_finding(1e-8, 1e-6),
+    ]
+    assert not list(chain.from_iterable(f.reasons + f.warnings for f in good))
+
+
+@pytest.mark.parametrize(
+    ("finding", "reason"),
+    [
+        (misfit(2.0, 1e-8, None), "misses something"),
+        (misfit(0.1, 1e-8, None), "not quiet"),
+        (trusted_range(1.0, LIMITS), "more or larger steps"),
+        (hidden_motion_finding(5e-6, 1e-6), "between samples may shift the lag by 5.0 µs"),
+        (separable_gain(0.02, 0.01), "uncertain by 3.9 %"),
+    ],
+)
+def test_bad_evidence_is_a_reason_by_name(finding, reason):
+    (text,) = finding.reasons
+    assert reason in text
+
+
+def test_the_band_of_the_gain_is_95_percent():
+    """A standard uncertainty of 0.0051 has a half-width of 0.01 at 1.96 sigma."""
+    assert separable_gain(0.00515, 0.01).reasons
+    assert not separable_gain(0.00505, 0.01).reasons
+
+
+def test_a_bias_of_half_a_microsecond_harms_nobody():
+    """It is 3 mdeg at 15 Hz: a lag known even better need not be rejected for it."""
+    assert not hidden_motion_finding(0.4e-6, 1e-9).reasons
+    assert hidden_motion_finding(0.6e-6, 1e-9).reasons
+
+
+def test_a_pole_beyond_the_trusted_band_is_warned_of():
+    (text,) = poles_beyond(FAST, 80.0).warnings
+    assert "1592 Hz" in text
+
+
+def test_a_wrong_order_asked_for_is_the_cause():
+    (text,) = misfit(2.0, 1e-8, 4).reasons
+    assert "the order asked for is wrong, 4 poles" in text
+    assert "backlash" not in text
+
+
+def test_widened_uncertainties_are_warned_of():
+    (text,) = requested_order(2, 6.3).warnings
+    assert "order 2" in text
+    assert "6.3 times as large" in text
+
+
+def test_the_limits_are_written_down():
+    """A reader must be able to repeat the verdict from the certificate alone."""
+    limits = misfit(1.0, 1e-8, None).limits | trusted_range(80.0, LIMITS).limits
+    assert limits["gain"] == LIMITS.gain
+    assert limits["phase_rad"] == LIMITS.phase
+    assert not misfit(0.999 * limits["chi_square_greatest"], 1e-8, None).reasons
+    assert misfit(1.001 * limits["chi_square_greatest"], 1e-8, None).reasons
+    assert misfit(0.999 * limits["chi_square_least"], 1e-8, None).reasons
+    assert trusted_range(0.999 * limits["valid_up_to_least_hz"], LIMITS).reasons
