@@ -1,8 +1,7 @@
 """The whole cell: a motion over a surface, as the devices report it and as it truly was.
 
-Imitated: the servo's lag, the probe's dynamics, scale, noise, resolution and range, the
-encoder's noise, a drift of the fixture, and latency of the probe. Not imitated: spindle
-error motion, Abbe offsets, speckle, slope-dependent intensity, friction.
+What is imitated, beside the probe's dynamics, scale, noise, resolution and range, the servo's lag
+and the encoder's noise, is what ``Disturbances`` lists; what is not stands in each family's file.
 """
 
 from __future__ import annotations
@@ -11,28 +10,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Motion
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, Status
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant, respond
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.plant import Plant
+from omsm_ros.twin.probe import Probe, read
+from omsm_ros.twin.scene import scene_of
+from omsm_ros.twin.true_response import TrueResponse
+from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """A chromatic confocal probe of the paper's kind.
-
-    scale: reading per true distance [1]; the paper's static error is placed here
-    noise: standard deviation of the reading [m];  resolution: of the reading [m]
-    half_range: beyond it the probe sees no target [m]
-    """
-
-    scale: float = PAPER_STATIC_GAIN
-    noise: float = 10 * NANOMETRE_M
-    resolution: float = 10 * NANOMETRE_M
-    half_range: float = 50 * MICROMETRE_M
+__all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +32,7 @@ class Cell:
     encoder_noise: standard deviation [m];  drift: of the fixture [m/s]
     latency: how late the probe's reading is [s]: it tells of the place it saw that long ago
     sample_period: of the common trigger [s];  seed: of all noise
+    disturbances: what else is not as it should be
     """
 
     plant: Plant = field(default_factory=Plant)
@@ -51,6 +42,7 @@ class Cell:
     latency: float = 0.0
     sample_period: float = 1e-3
     seed: int = 1
+    disturbances: Disturbances = field(default_factory=Disturbances)
 
     def __post_init__(self) -> None:
         if not 0 <= self.latency < np.inf:
@@ -60,18 +52,43 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Truth:
+    """What only the twin knows beside the motion of the probe; arrays of shape (n,).
+
+    carriage: true Z of the carriage at the trigger [m]
+    x, y: where on the chuck the probe looked [m]
+    surface: the part as it sits on the chuck
+    response: the transfer function from encoder to probe
+    """
+
+    carriage: FloatArray
+    x: FloatArray
+    y: FloatArray
+    surface: Surface
+    response: TrueResponse
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
     """Samples as reported, one block each, and the truth behind them; arrays of shape (n,).
 
     axes, distance: what the devices say
-    probe_motion: true motion of the probe, G · X_d, when the reading was made [m]
+    probe_motion: true motion of the probe, G · X_d, when (on the mean) the reading was made [m]
     surface_height: true height of the surface then under the probe [m]
+    truth: what else is true, None where nobody knows
+
+    ``probe_motion - truth.carriage`` is the true dynamic error.
     """
 
     axes: AxisBlock
     distance: DistanceBlock
     probe_motion: FloatArray
     surface_height: FloatArray
+    truth: Truth | None = None
+
+    def motion_record(self) -> MotionRecord:
+        """The samples on one grid, as an identification takes them."""
+        return assemble([self.axes], [self.distance])
 
 
 def record(
@@ -82,55 +99,51 @@ def record(
     stand_off: height of the probe's zero above the axis zero [m]; the reading is
     ``scale · (surface - probe motion - stand_off)``, rounded, and a lost target beyond range.
     """
+    streams = _random_streams(cell.seed)
+    errors = cell.disturbances
+    late = replace(errors.probe, latency_s=errors.probe.latency_s + cell.latency)
+    errors = replace(errors, probe=late)
     samples = round(motion.duration / cell.sample_period)
     time = np.arange(samples) * cell.sample_period
-    plant = _late(cell.plant, cell.latency)
-    moved = respond(plant, motion, samples, cell.sample_period, substeps)
-    command, seen = motion.positions(time), motion.positions(time - cell.latency)
-    truth = surface.height(
-        seen.x * np.cos(seen.c) + seen.y * np.sin(seen.c),
-        seen.y * np.cos(seen.c) - seen.x * np.sin(seen.c),
+    scene = scene_of(
+        cell.plant, errors, motion, surface, samples, cell.sample_period, substeps, streams
     )
-    encoder_random, probe_random = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(cell.seed).spawn(2)
-    )
+    seen = scene.over_an_exposure(time)
+    carriage, command = scene.carriage.at(time), motion.positions(time)
     axes = AxisBlock(
         stamp_ns=0,
         first_sample=0,
         sample_period=cell.sample_period,
         x=command.x,
         y=command.y,
-        z=moved.carriage + encoder_random.normal(0.0, cell.encoder_noise, samples),
+        z=carriage + streams["encoder"].normal(0.0, cell.encoder_noise, samples),
         b=command.b,
         c=command.c,
     )
-    true_distance = truth + cell.drift * time - moved.probe - stand_off
-    distance = _reading(cell.probe, true_distance, cell.sample_period, probe_random)
-    return Recording(axes=axes, distance=distance, probe_motion=moved.probe, surface_height=truth)
-
-
-def _late(plant: Plant, latency: float) -> Plant:
-    g = plant.dynamics
-    late = TransferFunction(g.numerator, g.denominator, g.delay + latency)
-    return replace(plant, dynamics=late)
-
-
-def _reading(
-    probe: Probe, true_distance: FloatArray, period: float, random: np.random.Generator
-) -> DistanceBlock:
-    samples = len(true_distance)
-    noisy = probe.scale * true_distance + random.normal(0.0, probe.noise, samples)
-    resolution = probe.resolution
-    reading = np.round(noisy / resolution) * resolution if resolution else noisy
-    in_range = abs(true_distance) <= probe.half_range
-    return DistanceBlock(
-        stamp_ns=0,
-        first_sample=0,
-        sample_period=period,
-        distance=np.where(in_range, reading, np.nan),
-        intensity=np.where(in_range, 0.5, 0.0).astype(np.float32),
-        status=np.where(in_range, Status.OK, Status.NO_TARGET).astype(np.uint8),
+    true_distance = seen.surface + (cell.drift * time + seen.raised) - seen.probe - stand_off
+    return Recording(
+        axes=axes,
+        distance=read(cell.probe, late, true_distance, cell.sample_period, streams["probe"]),
+        probe_motion=seen.probe,
+        surface_height=seen.surface,
+        truth=Truth(
+            carriage=carriage,
+            x=seen.x,
+            y=seen.y,
+            surface=scene.surface,
+            response=TrueResponse(cell.plant.dynamics.normalised(), errors.structure, late),
+        ),
     )
+
+
+# A new stream goes to the end: those before it stay as they are.
+_STREAMS = ("encoder", "probe", "drift", "vibration")
+
+
+def _random_streams(seed: int) -> dict[str, np.random.Generator]:
+    """Independent random numbers for each use, so that switching one on leaves the others."""
+    children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
+    return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
 
 
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:

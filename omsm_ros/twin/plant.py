@@ -14,6 +14,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunct
 from omsm_ros.core.machine.trajectories import Motion
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.trajectory import Trajectory
 
 PAPER_EQ_12 = TransferFunction.from_ascending(
     # The print lacks the s behind 1.22e8; without it the plant would be unstable.
@@ -64,38 +65,74 @@ class Response:
     probe: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """True motion as signals in time [m]: of the carriage and of the probe."""
+
+    carriage: Trajectory
+    probe: Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """When the simulation steps, and which of its steps are kept.
+
+    lead, samples: sample periods before and after time 0
+    sample_period: [s];  substeps: steps in a sample period;  every: steps from kept to kept
+    """
+
+    lead: int
+    samples: int
+    sample_period: float
+    substeps: int
+    every: int
+
+    @property
+    def step(self) -> float:
+        """[s]"""
+        return self.sample_period / self.substeps
+
+
 def respond(
     plant: Plant, motion: Motion, samples: int, sample_period: float, substeps: int = 16
 ) -> Response:
-    """Move the plant through ``motion`` and look at it every ``sample_period`` [s].
+    """Move the plant through ``motion`` and look at it every ``sample_period`` [s]."""
+    lead = int(np.ceil(plant.lead_in() / sample_period))
+    moved = move(plant, motion, Grid(lead, samples, sample_period, substeps, substeps))
+    at_samples = slice(lead - 1, lead - 1 + samples)
+    return Response(moved.carriage.values[at_samples], moved.probe.values[at_samples])
+
+
+def move(plant: Plant, motion: Motion, grid: Grid) -> Movement:
+    """Move the plant through ``motion`` from ``grid.lead`` periods before time 0.
 
     Each sample period is cut into ``substeps``; the command is held at its value in the
     middle of each, which is exact for a sharp step on the grid and of second order for
     a smooth motion. The delay is taken in the argument of the command, so it is exact too;
     only a sharp step that it moves off the grid is off by up to half a substep.
     """
-    step = sample_period / substeps
-    lead = int(np.ceil(plant.lead_in() / sample_period))
-    samples_with_lead = lead + samples
-
-    def seen_through(system: TransferFunction, delay: float) -> FloatArray:
-        sections = _zero_order_hold_sections(system, step)
-        state = np.zeros((len(sections), 2))
-        start = _command(motion, -lead * sample_period - delay, 1, step)[0]
-        seen = []
-        for first in range(0, samples_with_lead, _CHUNK_SAMPLES):
-            count = min(_CHUNK_SAMPLES, samples_with_lead - first)
-            begin = (first - lead) * sample_period - delay
-            held = _command(motion, begin, count * substeps, step) - start
-            moved, state = signal.sosfilt(sections, held, zi=state)
-            seen.append(moved[substeps - 1 :: substeps])
-        # Sample k is the end of the step before it.
-        return np.asarray(np.concatenate(seen)[lead - 1 : -1] + system.dc_gain * start)
-
     servo, both = plant.servo, _series(plant.servo, plant.dynamics)
-    return Response(
-        carriage=seen_through(servo, 0.0), probe=seen_through(both, plant.dynamics.delay)
+    return Movement(
+        _seen_through(servo, 0.0, motion, grid),
+        _seen_through(both, plant.dynamics.delay, motion, grid),
     )
+
+
+def _seen_through(system: TransferFunction, delay: float, motion: Motion, grid: Grid) -> Trajectory:
+    step, period, substeps, every = grid.step, grid.sample_period, grid.substeps, grid.every
+    sections = _zero_order_hold_sections(system, step)
+    state = np.zeros((len(sections), 2))
+    start = _command(motion, -grid.lead * period - delay, 1, step)[0]
+    seen = []
+    for first in range(0, grid.lead + grid.samples, _CHUNK_SAMPLES):
+        count = min(_CHUNK_SAMPLES, grid.lead + grid.samples - first)
+        begin = (first - grid.lead) * period - delay
+        held = _command(motion, begin, count * substeps, step) - start
+        moved, state = signal.sosfilt(sections, held, zi=state)
+        seen.append(moved[every - 1 :: every])
+    # A value is what was reached at the end of its step.
+    values = np.concatenate(seen) + system.dc_gain * start
+    return Trajectory(every * step - grid.lead * period, every * step, values)
 
 
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:

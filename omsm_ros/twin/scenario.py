@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from omsm_ros.core.machine.trajectories import Spiral, StepTest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Recording, record
+from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.figure_error import FigureError
+from omsm_ros.twin.machine_errors import PartPose
 
 
 @dataclass(frozen=True)
@@ -25,19 +27,25 @@ class Scenario:
     sample_period: float = 1e-3
 
 
-def step_test_of(scenario: Scenario) -> Recording:
-    """The step test on a fixed flat, its middle in the middle of the probe's range."""
+def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
+    """The step test on a fixed flat, its middle in the middle of the probe's range.
+
+    The flat is no part: it has no pose.
+    """
     motion = StepTest(rise=scenario.step_rise)
     middle = motion.count * motion.step / 2
-    cell = Cell(seed=scenario.seed, sample_period=scenario.sample_period)
+    on_a_flat = replace(disturbances, machine=replace(disturbances.machine, pose=PartPose()))
+    cell = Cell(seed=scenario.seed, sample_period=scenario.sample_period, disturbances=on_a_flat)
     return record(cell, motion, Flat(), stand_off=-middle)
 
 
-def scan_of(scenario: Scenario) -> Recording:
+def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """The spiral over the paper's mirror, as it really is."""
     motion = spiral_of(scenario)
     # Another seed than the step test's: the same noise twice would be no independent check.
-    cell = Cell(seed=scenario.seed + 1, sample_period=scenario.sample_period)
+    cell = Cell(
+        seed=scenario.seed + 1, sample_period=scenario.sample_period, disturbances=disturbances
+    )
     made = FigureError(PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, scenario.seed)
     return record(cell, motion, made)
 

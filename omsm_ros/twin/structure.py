@@ -1,0 +1,253 @@
+"""What a real structure does beside G(s): it creeps, rocks, has backlash, drags and stiffens.
+
+``carriage → G(s) → creep, soft modes → stiffness → backlash → friction → probe``
+
+All but creep and soft modes act at once, on the deflection or on the position, so they are as
+fine in time as G's own output is. Not imitated: backlash and friction within the servo loop,
+stiffness that changes the frequency of a mode (it scales the whole deflection), temperature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.machine.trajectories import s_curve
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.twin.plant import Movement
+from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.trajectory import Trajectory
+
+# The machine comes to its motion within this time, so that a soft mode is not struck.
+_SPIN_UP_S = 4.0
+# Two relaxations a decade lie within 0.5 % of a straight line in the logarithm of time.
+_RELAXATIONS_PER_DECADE = 2
+# A change smaller than this between two steps is rounding, not a reversal [m].
+_STILL_M = 1e-16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Creep:
+    """A part of each move comes late: ``1 - ε + ε / (1 + sτ)``.
+
+    fraction: ε of the move [1];  time_constant_s: τ
+    """
+
+    fraction: float
+    time_constant_s: float
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("time_constant_s",))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogCreep:
+    """Creep in proportion to the logarithm of time, as piezos and grease have it.
+
+    fraction_per_decade: of the move, in each decade from shortest_s to longest_s [1]
+    """
+
+    fraction_per_decade: float
+    shortest_s: float = 0.01
+    longest_s: float = 1000.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("shortest_s", "longest_s"))
+
+    @property
+    def relaxations(self) -> tuple[Creep, ...]:
+        """The same as a row of equal relaxations, their time constants in equal ratios."""
+        decades = np.log10(self.longest_s / self.shortest_s)
+        count = max(round(decades * _RELAXATIONS_PER_DECADE), 0) + 1
+        each = self.fraction_per_decade / _RELAXATIONS_PER_DECADE
+        spread = np.geomspace(self.shortest_s, self.longest_s, count)
+        return tuple(Creep(fraction=each, time_constant_s=float(tau)) for tau in spread)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SoftMode:
+    """A weak mode of base or isolator: ``1 - p + p ω² / (s² + 2ζω s + ω²)``.
+
+    participation: p, its part of the motion at rest [1]
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    participation: float
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("frequency_hz", "damping_ratio"))
+
+    @property
+    def omega(self) -> float:
+        """[rad/s]"""
+        return 2 * np.pi * self.frequency_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Friction:
+    """Pre-sliding drag (Dahl 1968): the probe is held back by up to ``drag_m``.
+
+    dF/dz = (1 - F sgn ż) / presliding_m, F from -1 to 1
+    """
+
+    drag_m: float
+    presliding_m: float
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("presliding_m",))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StructureErrors:
+    """Between carriage and probe; nothing by default.
+
+    creep, log_creep, soft_modes: linear, slow
+    compliance_per_m: the deflection ``carriage - probe`` grows by this part per metre of Z
+    hardening_deflection_m: deflection at which a hardening spring has twice its stiffness
+    backlash_m: lost motion at a reversal, the full width of the loop
+    friction: pre-sliding drag
+    """
+
+    creep: tuple[Creep, ...] = ()
+    log_creep: LogCreep | None = None
+    soft_modes: tuple[SoftMode, ...] = ()
+    compliance_per_m: float = 0.0
+    hardening_deflection_m: float | None = None
+    backlash_m: float = 0.0
+    friction: Friction | None = None
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("hardening_deflection_m",), not_negative=("backlash_m",))
+
+    @property
+    def relaxations(self) -> tuple[Creep, ...]:
+        """Every relaxation of both laws of creep."""
+        return self.creep + (self.log_creep.relaxations if self.log_creep else ())
+
+    @property
+    def lead_s(self) -> float:
+        """How long the machine must have been moving before time 0."""
+        return _SPIN_UP_S if self.relaxations or self.soft_modes else 0.0
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """Creep and soft modes at complex ``s`` [rad/s]; what is not linear is not in it."""
+        result = np.ones_like(s)
+        for creep in self.relaxations:
+            result += creep.fraction * (1 / (1 + s * creep.time_constant_s) - 1)
+        for mode in self.soft_modes:
+            ratio = mode.omega**2 / (s**2 + 2 * mode.damping_ratio * mode.omega * s + mode.omega**2)
+            result += mode.participation * (ratio - 1)
+        return result
+
+
+def deform(errors: StructureErrors, moved: Movement) -> Movement:
+    """What becomes of the probe's motion ``moved`` in a structure with ``errors``."""
+    if is_default(errors):
+        return moved
+    carriage, probe = moved.carriage.values, moved.probe.values
+    probe = probe + _slow_parts(errors, moved.probe)
+    probe = _stiffened(errors, carriage, probe)
+    if errors.backlash_m:
+        probe = backlash(probe, errors.backlash_m)
+    if errors.friction:
+        probe = probe - errors.friction.drag_m * friction(probe, errors.friction.presliding_m)
+    return Movement(moved.carriage, Trajectory(moved.probe.start, moved.probe.step, probe))
+
+
+def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
+    """What creep and soft modes add to the motion of the probe (n,) [m]."""
+    if not errors.lead_s:
+        return np.zeros(1)
+    moving = _spun_up(probe)
+    added = np.zeros_like(moving)
+    for creep in errors.relaxations:
+        filtered = _through(([1.0], [creep.time_constant_s, 1.0]), moving, probe.step)
+        added += creep.fraction * (filtered - moving)
+    for mode in errors.soft_modes:
+        omega = mode.omega
+        ratio = ([omega**2], [1.0, 2 * mode.damping_ratio * omega, omega**2])
+        added += mode.participation * (_through(ratio, moving, probe.step) - moving)
+    return added
+
+
+def _spun_up(probe: Trajectory) -> FloatArray:
+    """The motion, coming up smoothly from rest at its mean before time 0, about that mean."""
+    before = max(round(-probe.start / probe.step), 1)
+    mean = probe.values[:before].mean()
+    moving = probe.values - mean
+    moving[:before] *= s_curve(np.arange(before) / before)
+    return moving
+
+
+def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: float) -> FloatArray:
+    """``values`` at rest before, joined by straight lines, through a continuous filter: exactly."""
+    numerator, denominator, _ = signal.cont2discrete(ratio, step, method="foh")
+    return np.asarray(signal.lfilter(numerator.ravel(), denominator, values))
+
+
+def _stiffened(errors: StructureErrors, carriage: FloatArray, probe: FloatArray) -> FloatArray:
+    if not errors.compliance_per_m and errors.hardening_deflection_m is None:
+        return probe
+    deflection = (carriage - probe) * (1 + errors.compliance_per_m * carriage)
+    if errors.hardening_deflection_m is not None:
+        deflection = hardened(deflection, errors.hardening_deflection_m)
+    return np.asarray(carriage - deflection)
+
+
+def hardened(linear: FloatArray, scale: float) -> FloatArray:
+    """Deflection δ of a spring whose stiffness is ``1 + (δ/scale)²`` times the ``linear`` one's.
+
+    The real root of ``δ + δ³/scale² = linear`` [m].
+    """
+    root3 = np.sqrt(3.0)
+    return np.asarray(
+        2 * scale / root3 * np.sinh(np.arcsinh(1.5 * root3 * linear / scale) / 3), np.float64
+    )
+
+
+def backlash(position: FloatArray, width: float) -> FloatArray:
+    """What follows ``position`` (n,) [m] with lost motion of ``width`` [m], centred at first."""
+    half, state = width / 2, position[0]
+    starts, rising = [], []
+    runs = list(_monotone_runs(position))
+    for _, last, up in runs:
+        starts.append(state)
+        rising.append(up)
+        end = position[last - 1]
+        state = max(state, end - half) if up else min(state, end + half)
+    lengths = [last - first for first, last, _ in runs]
+    start, up_run = np.repeat(starts, lengths), np.repeat(rising, lengths)
+    return np.where(up_run, np.maximum(start, position - half), np.minimum(start, position + half))
+
+
+def friction(position: FloatArray, presliding: float) -> FloatArray:
+    """Dahl's friction, -1 to 1 (n,), along ``position`` (n,) [m], none at first.
+
+    Along a run of one direction s: ``F = s - (s - F₀) exp(-|z - z₀| / presliding)``.
+    """
+    result, state = np.empty_like(position), 0.0
+    for first, last, up in _monotone_runs(position):
+        sign = 1.0 if up else -1.0
+        travel = abs(position[first:last] - position[max(first - 1, 0)])
+        result[first:last] = sign - (sign - state) * np.exp(-travel / presliding)
+        state = result[last - 1]
+    return result
+
+
+def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
+    """Pieces ``first:last`` in which the position only rises (True) or only falls, in order."""
+    change = np.diff(position, prepend=position[0])
+    moving = abs(change) > _STILL_M
+    # At rest the direction is that of the last move.
+    latest = np.maximum.accumulate(np.where(moving, np.arange(len(position)), 0))
+    up = change[latest] > 0
+    cuts = np.flatnonzero(up[1:] != up[:-1]) + 1
+    bounds = [0, *cuts.tolist(), len(position)]
+    for first, last in pairwise(bounds):
+        yield first, last, bool(up[first])

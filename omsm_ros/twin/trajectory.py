@@ -1,0 +1,57 @@
+"""A simulated signal that can be looked at when a device looks, not only when it was computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+
+# An instant this close to the grid, in steps, is on it: what rounding leaves of k · period.
+_ON_THE_GRID = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """``values`` (n,) at ``start`` [s] and every ``step`` [s] after it."""
+
+    start: float
+    step: float
+    values: FloatArray
+
+    @property
+    def times(self) -> FloatArray:
+        """Instants of the values [s], (n,)."""
+        return self.start + np.arange(len(self.values)) * self.step
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Value at ``time`` [s], of its shape: itself on the grid, a cubic through four beside it.
+
+        Raises ConfigurationError for a time before the start or after the end.
+        """
+        place = (time - self.start) / self.step
+        nearest = np.rint(place)
+        last = len(self.values) - 1
+        if place.size and not -_ON_THE_GRID <= place.min() <= place.max() <= last + _ON_THE_GRID:
+            raise ConfigurationError(
+                f"twin: asked for {time.min():g} to {time.max():g} s, simulated are "
+                f"{self.start:g} to {self.times[-1]:g} s; a clock cannot be off by so much"
+            )
+        if np.all(abs(place - nearest) < _ON_THE_GRID):
+            return np.asarray(self.values[nearest.astype(np.int64)])
+        return self._between(place)
+
+    def _between(self, place: FloatArray) -> FloatArray:
+        """Lagrange's cubic through the two values before and the two after ``place`` [steps]."""
+        index = np.clip(np.floor(place).astype(np.int64), 1, len(self.values) - 3)
+        u = place - index
+        v, w, q = u + 1, u - 1, u - 2
+        values = self.values
+        return np.asarray(
+            -u * w * q / 6 * values[index - 1]
+            + v * w * q / 2 * values[index]
+            - v * u * q / 2 * values[index + 1]
+            + v * u * w / 6 * values[index + 2]
+        )

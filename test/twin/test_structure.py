@@ -1,0 +1,162 @@
+"""Creep, soft modes, backlash, friction and stiffness against closed forms and second methods."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.plant import Movement
+from omsm_ros.twin.structure import (
+    Creep,
+    Friction,
+    LogCreep,
+    SoftMode,
+    StructureErrors,
+    backlash,
+    deform,
+    friction,
+    hardened,
+)
+from omsm_ros.twin.trajectory import Trajectory
+
+STEP_S = 1e-3
+
+
+def _deformed(errors, carriage, probe=None, start=-10.0):
+    """Motion of the probe where the clean one would be ``probe``, by default the carriage's."""
+    made = [Trajectory(start, STEP_S, z) for z in (carriage, carriage if probe is None else probe)]
+    return deform(errors, Movement(*made)).probe.values
+
+
+def _times(duration=30.0, start=-10.0):
+    return start + np.arange(round((duration - start) / STEP_S)) * STEP_S
+
+
+@pytest.mark.parametrize("tau", [0.05, 2.0, 20.0])
+def test_a_step_creeps_by_its_fraction_with_its_time_constant(tau):
+    t = _times()
+    step = np.where(t > 0, 10e-6, 0.0)
+    found = _deformed(StructureErrors(creep=(Creep(fraction=1e-2, time_constant_s=tau),)), step)
+    after = t > 0
+    # The step rises along a straight line from the sample before it, half a step early.
+    expected = 10e-6 * (1 - 1e-2 * np.exp(-(t[after] + 0.5 * STEP_S - STEP_S) / tau))
+    np.testing.assert_allclose(found[after], expected, rtol=0, atol=1e-2 * 10e-6 * 2e-4)
+    assert np.all(found[~after] == 0)
+
+
+def test_logarithmic_creep_is_straight_in_the_logarithm_of_time():
+    t = _times(duration=120.0)
+    step = np.where(t > 0, 1.0, 0.0)
+    law = LogCreep(fraction_per_decade=1e-3, shortest_s=0.01, longest_s=1000.0)
+    found = _deformed(StructureErrors(log_creep=law), step)
+    at = np.searchsorted(t, [0.1, 1.0, 10.0, 100.0])
+    np.testing.assert_allclose(np.diff(found[at]), 1e-3, rtol=0.03)
+
+
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 8.0, 20.0])
+def test_a_swing_comes_out_as_the_response_says(frequency):
+    errors = StructureErrors(
+        creep=(Creep(fraction=3e-3, time_constant_s=1.0),),
+        soft_modes=(SoftMode(frequency_hz=7.0, damping_ratio=0.1, participation=1e-2),),
+    )
+    t = _times(20.0)
+    found = _deformed(errors, np.cos(2 * np.pi * frequency * t))
+    late = t > 10  # what the spin-up left has died away
+    turning = np.exp(2j * np.pi * frequency * t[late])
+    expected = (errors.response(np.array([2j * np.pi * frequency])) * turning).real
+    np.testing.assert_allclose(found[late], expected, rtol=0, atol=2e-5)
+
+
+def test_at_rest_nothing_is_added():
+    errors = StructureErrors(
+        creep=(Creep(fraction=1e-3, time_constant_s=5.0),),
+        soft_modes=(SoftMode(frequency_hz=2.0, damping_ratio=0.02, participation=1e-3),),
+        backlash_m=1e-7,
+        friction=Friction(drag_m=5e-8, presliding_m=1e-6),
+    )
+    np.testing.assert_allclose(_deformed(errors, np.full(20_000, 3e-6)), 3e-6, atol=1e-18)
+    assert abs(errors.response(np.zeros(1, complex)) - 1) < 1e-15
+
+
+def test_the_loop_of_backlash_is_as_wide_as_stated():
+    turn = np.linspace(0, 6 * np.pi, 60_001)
+    position = 1e-6 * np.sin(turn)
+    followed = backlash(position, 60e-9)
+    rising = (turn > 4 * np.pi - 1) & (turn < 4 * np.pi + 1)  # well after a reversal
+    falling = (turn > 5 * np.pi - 1) & (turn < 5 * np.pi + 1)
+    np.testing.assert_allclose(position[rising] - followed[rising], 30e-9, atol=1e-15)
+    np.testing.assert_allclose(position[falling] - followed[falling], -30e-9, atol=1e-15)
+
+
+def _paths():
+    random = np.random.default_rng(3)
+    yield np.cumsum(random.normal(0, 1e-8, 5000))
+    yield np.repeat(np.cumsum(random.normal(0, 1e-8, 500)), 10)  # with rests
+    yield np.zeros(10)
+
+
+@pytest.mark.parametrize("path", list(_paths()), ids=["walk", "with rests", "at rest"])
+def test_backlash_is_the_play_operator_step_by_step(path):
+    state, expected = path[0], []
+    for z in path:
+        state = min(max(state, z - 20e-9), z + 20e-9)
+        expected.append(state)
+    np.testing.assert_allclose(backlash(path, 40e-9), expected, atol=1e-21)
+
+
+@pytest.mark.parametrize("path", list(_paths()), ids=["walk", "with rests", "at rest"])
+def test_friction_obeys_dahls_equation_step_by_step(path):
+    state, expected = 0.0, [0.0]
+    for dz in np.diff(path):
+        sign = np.sign(dz)
+        state = sign - (sign - state) * np.exp(-abs(dz) / 30e-9) if dz else state
+        expected.append(state)
+    np.testing.assert_allclose(friction(path, 30e-9), expected, atol=1e-12)
+
+
+def test_friction_turns_over_within_the_presliding_distance():
+    there = np.linspace(0, 100e-6, 10_001)
+    path = np.r_[there, there[-2::-1]]
+    found = friction(path, 1e-6)
+    assert found[10_000] == pytest.approx(1.0)
+    # One micrometre after the reversal:
+    assert found[10_100] == pytest.approx(-1 + 2 * np.exp(-1), abs=1e-3)
+    assert found[-1] == pytest.approx(-1.0)
+
+
+def test_the_probe_is_held_back_by_the_drag():
+    there = np.linspace(0, 100e-6, 20_001)
+    errors = StructureErrors(friction=Friction(drag_m=50e-9, presliding_m=1e-6))
+    assert there[-1] - _deformed(errors, there)[-1] == pytest.approx(50e-9)
+
+
+def test_a_hardening_spring_obeys_its_law():
+    linear = np.linspace(-3e-6, 3e-6, 101)
+    found = hardened(linear, 1e-6)
+    np.testing.assert_allclose(found + found**3 / 1e-12, linear, atol=1e-20)
+    # At its scale the stiffness has doubled: half of the linear deflection of 2 µm.
+    assert hardened(np.array([2e-6]), 1e-6)[0] == pytest.approx(1e-6)
+
+
+def test_stiffness_changes_the_deflection_along_z():
+    carriage = np.linspace(-1e-3, 1e-3, 2001)
+    probe = carriage - 300e-9
+    found = _deformed(StructureErrors(compliance_per_m=100.0), carriage, probe)
+    np.testing.assert_allclose(carriage - found, 300e-9 * (1 + 100 * carriage), atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: StructureErrors(backlash_m=-1e-9), "backlash_m"),
+        (lambda: StructureErrors(hardening_deflection_m=0.0), "hardening_deflection_m"),
+        (lambda: Creep(fraction=1e-3, time_constant_s=0.0), "time_constant_s"),
+        (lambda: Creep(fraction=np.nan, time_constant_s=1.0), "fraction"),
+        (lambda: Friction(drag_m=1e-9, presliding_m=-1.0), "presliding_m"),
+        (lambda: SoftMode(frequency_hz=0.0, damping_ratio=0.1, participation=0.1), "frequency_hz"),
+    ],
+)
+def test_sizes_that_cannot_be_are_named(make, name):
+    with pytest.raises(ConfigurationError, match=name):
+        make()
