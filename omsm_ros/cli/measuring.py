@@ -24,6 +24,7 @@ CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
 
 def geometry_of(path: Path | None) -> Geometry:
+    """Return the probe's place from a file, or none but zeros without one."""
     return load_geometry(path) if path else Geometry()
 
 

@@ -282,6 +282,7 @@ class GenericStreamDevice:
 
     @property
     def statistics(self) -> StreamStatistics:
+        """Return all counts since the device was made."""
         tracker, cutter = self._tracker, self._cutter
         return StreamStatistics(
             **asdict(self._decoder.statistics),

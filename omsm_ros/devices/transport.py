@@ -23,7 +23,9 @@ class Transport(Protocol):
     """A byte stream with a name to put into messages."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Return what the stream is called in messages: a port, or a host and its port."""
+        ...
 
     def open(self) -> None:
         """Connect; raises DeviceError."""

@@ -90,12 +90,24 @@ def measure(
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
     if report:
-        # Here, because drawing takes longer to load than a scan to correct.
-        from omsm_ros.jobs.publish import MOST_DRAWN, figures_of, publish
-
-        figures = figures_of(cloud.read(MOST_DRAWN), calibration, nominal, period)
-        publish(out, f"Surface of {bag.name}", summary, calibration, figures)
+        _draw(out, bag, cloud, summary, calibration, nominal, period)
     return summary
+
+
+def _draw(
+    out: Path,
+    bag: Path,
+    cloud: CloudFile,
+    summary: dict[str, Any],
+    calibration: Calibration,
+    nominal: Surface | None,
+    period: float,
+) -> None:
+    # Here, because drawing takes longer to load than a scan to correct.
+    from omsm_ros.jobs.publish import MOST_DRAWN, figures_of, publish
+
+    figures = figures_of(cloud.read(MOST_DRAWN), calibration, nominal, period)
+    publish(out, f"Surface of {bag.name}", summary, calibration, figures)
 
 
 def summarise(

@@ -121,19 +121,7 @@ class Stage:
 def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: Stage) -> None:
     """Run the cell: step test, identification, scan, recording."""
     with stage("starting the cell and its nodes"):
-        processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
-        processes.start("confocal_driver", port=plan.link, sample_period=plan.sample_period)
-        processes.start(
-            "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
-        )
-        processes.start("corrector")
-        node.wait_until(
-            "the driver, calibrator and corrector to find each other",
-            lambda: (
-                node.value("confocal_driver", "axes_subscribers") >= 2
-                and node.value("confocal_driver", "confocal_subscribers") >= 2
-            ),
-        )
+        _start(node, processes, plan)
     steps = plan.step_test_samples
     with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
         node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
@@ -154,22 +142,42 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
                 and node.value("corrector", "points_subscribers") >= 1
             ),
         )
-    scan, earlier = plan.scan_samples, node.value("confocal_driver", "blocks")
-    with stage(f"scanning the mirror: {scan} points", scan) as progress:
-        node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
-        _follow(node, "corrector", ("axes_received", "distance_received"), scan, progress)
-        node.wait_until(
-            "the last clouds to be recorded",
-            lambda: (
-                node.value("recorder", "/omsm/points")
-                == node.value("corrector", "clouds_published")
-                and node.value("recorder", "/omsm/axes")
-                == node.value("recorder", "/omsm/confocal")
-                == node.value("confocal_driver", "blocks") - earlier
-            ),
-        )
+    with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
+        _scan(node, plan.scan_samples, progress)
     with stage("ending the nodes"):
         processes.end()
+
+
+def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
+    processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
+    processes.start("confocal_driver", port=plan.link, sample_period=plan.sample_period)
+    processes.start(
+        "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
+    )
+    processes.start("corrector")
+    node.wait_until(
+        "the driver, calibrator and corrector to find each other",
+        lambda: (
+            node.value("confocal_driver", "axes_subscribers") >= 2
+            and node.value("confocal_driver", "confocal_subscribers") >= 2
+        ),
+    )
+
+
+def _scan(node: DemoNode, samples: int, progress: Callable[[int], None]) -> None:
+    """Scan, and wait until all of it is corrected and recorded."""
+    earlier = node.value("confocal_driver", "blocks")
+    node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
+    _follow(node, "corrector", ("axes_received", "distance_received"), samples, progress)
+    node.wait_until(
+        "the last clouds to be recorded",
+        lambda: (
+            node.value("recorder", "/omsm/points") == node.value("corrector", "clouds_published")
+            and node.value("recorder", "/omsm/axes")
+            == node.value("recorder", "/omsm/confocal")
+            == node.value("confocal_driver", "blocks") - earlier
+        ),
+    )
 
 
 def _follow(

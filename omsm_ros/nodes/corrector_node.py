@@ -60,25 +60,8 @@ class CorrectorNode(Node):
         self._override = parameter(
             self, "override", False, "use a calibration that does not belong; every cloud says so"
         )
-        self._options = CorrectionOptions(
-            polarity=parameter(
-                self, "polarity", 1, "+1: distance falls as z rises; -1: the other way"
-            ),
-            accept_other_rate=self._override,
-            lateral_lag=self._lateral_lag(),
-            geometry=Geometry(
-                **{
-                    name: parameter(self, f"geometry.{name}", 0.0, "of the probe [m] or slope")
-                    for name in GEOMETRY
-                }
-            ),
-        )
-        # What the certificate tells is used unless something else is stated here.
-        stated = {
-            name: parameter(self, f"sources.{name}", 0.0, "SI, k = 1; 0 = certificate")
-            for name in SOURCES
-        }
-        self._sources = {name: value for name, value in stated.items() if value}
+        self._options = self._options_asked()
+        self._sources = self._sources_stated()
         self._frame = FRAME
         self._messages = conversions.ros_messages()
         self._calibration: Calibration | None = None
@@ -104,11 +87,31 @@ class CorrectorNode(Node):
         if not path:
             self.get_logger().info("no calibration yet: nothing will be published")
 
-    # ------------------------------------------------------------------- calibration
-
-    def _lateral_lag(self) -> float | None:
+    def _options_asked(self) -> CorrectionOptions:
         lag = parameter(self, "lateral_lag", -1.0, "of the probe [s]; negative = as calibrated")
-        return None if lag < 0 else float(lag)
+        return CorrectionOptions(
+            polarity=parameter(
+                self, "polarity", 1, "+1: distance falls as z rises; -1: the other way"
+            ),
+            accept_other_rate=self._override,
+            lateral_lag=None if lag < 0 else float(lag),
+            geometry=Geometry(
+                **{
+                    name: parameter(self, f"geometry.{name}", 0.0, "of the probe [m] or slope")
+                    for name in GEOMETRY
+                }
+            ),
+        )
+
+    def _sources_stated(self) -> dict[str, float]:
+        """What the certificate tells is used unless something else is stated here."""
+        stated = {
+            name: parameter(self, f"sources.{name}", 0.0, "SI, k = 1; 0 = certificate")
+            for name in SOURCES
+        }
+        return {name: value for name, value in stated.items() if value}
+
+    # ------------------------------------------------------------------- calibration
 
     def _use(self, calibration: Calibration) -> None:
         reasons = objections(

@@ -98,6 +98,7 @@ class FrameDecoder:
 
     @property
     def statistics(self) -> DecoderStatistics:
+        """Return all counts since the decoder was made."""
         return DecoderStatistics(
             bytes_received=self._bytes,
             bytes_discarded=self._bytes - ENCODED_SIZE * self._frames - len(self._tail),

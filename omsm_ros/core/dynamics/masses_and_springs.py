@@ -10,6 +10,7 @@ together, so one of them has to be known, ``m1``, or taken as the unit of the ot
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -119,21 +120,30 @@ def fit_two_mass(
         turned = np.angle(np.exp(1j * difference.imag))
         return np.asarray(whiten @ np.concatenate([difference.real, turned]))
 
+    best = _least(residual, _starts(oscillating, table_mass))
+    spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
+    variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
+    freedom = max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1)
+    return TwoMassFit(
+        model(best.x),
+        np.sqrt(np.maximum(variance, 0.0)),
+        float(np.sqrt(2 * best.cost / freedom)),
+    )
+
+
+def _least(
+    residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]
+) -> optimize.OptimizeResult:
+    """The least sum of squares; all ``starts`` race, and the best of them is followed."""
+
     def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
         box = (start - _SEARCHED, start + _SEARCHED)
         return optimize.least_squares(
             residual, start, x_scale="jac", bounds=box, max_nfev=evaluations
         )
 
-    raced = [descend(start, _RACE_EVALUATIONS) for start in _starts(oscillating, table_mass)]
-    best = descend(min(raced, key=lambda found: float(found.cost)).x, None)
-    spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
-    variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
-    return TwoMassFit(
-        model(best.x),
-        np.sqrt(np.maximum(variance, 0.0)),
-        float(np.sqrt(2 * best.cost / max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1))),
-    )
+    raced = [descend(start, _RACE_EVALUATIONS) for start in starts]
+    return descend(min(raced, key=lambda found: float(found.cost)).x, None)
 
 
 def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArray:

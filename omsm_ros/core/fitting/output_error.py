@@ -210,6 +210,7 @@ class Fit:
 
     @property
     def structure(self) -> Structure:
+        """Poles, zeros and delay that were fitted."""
         return self.scaled.structure
 
     @property

@@ -37,9 +37,11 @@ class HeldProblem(Problem):
 
     @cached_property
     def closed_length(self) -> int:
+        """Samples of the record: a held input needs no bridge back to its start."""
         return len(self.motion)
 
     def closed_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,) as they are, shape (k,)."""
         return np.asarray(fft.rfft(values), np.complex128)
 
     @cached_property
@@ -48,6 +50,7 @@ class HeldProblem(Problem):
 
     @cached_property
     def s(self) -> ComplexArray:
+        """2 (z − 1) / (z + 1) / period / rate on the unit circle, w of a held input, (k,)."""
         angle = np.pi * fft.rfftfreq(self.closed_length)
         return np.asarray(2j / self.period * np.tan(angle) / self.rate, np.complex128)
 

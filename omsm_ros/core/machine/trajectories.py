@@ -31,7 +31,9 @@ class Motion(Protocol):
     """A motion of the cell of ``duration`` [s]."""
 
     @property
-    def duration(self) -> float: ...
+    def duration(self) -> float:
+        """From the first commanded position to the last [s]."""
+        ...
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Commanded axes at ``time`` [s]; negative before the start."""

@@ -1,9 +1,11 @@
-"""Which structures are tried, and which is chosen."""
+"""Which structures are tried, and which is chosen, on steps through systems of known order."""
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
+import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.model_structure import Structure
@@ -12,94 +14,184 @@ from omsm_ros.core.fitting.order_choice import (
     cancels,
     choose,
     explore,
+    held_out_rms,
     information,
     structures,
 )
+from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.output_error import Problem, fit
+from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.twin.plant import Plant, respond
+
+NOISE = 1e-8
+FIRST_ORDER = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
+OMEGA = 2 * np.pi * 40.0
+PAIR = TransferFunction.from_ascending([1.0], [1.0, 0.2 / OMEGA, OMEGA**-2])
+PAIR_AND_POLE = TransferFunction.from_ascending(
+    [1.0], np.polynomial.polynomial.polymul([1.0, 0.2 / OMEGA, OMEGA**-2], [1.0, 8e-3])
+)
 
 
-def fitted(structure, sum_of_squares, samples=1000):
-    return SimpleNamespace(
-        structure=structure,
-        size=structure.size,
-        sum_of_squares=sum_of_squares,
-        samples=samples,
-        dynamics=TransferFunction([1.0], [1.0, 1e-3]),
-    )
+@lru_cache(maxsize=8)
+def problem_of(dynamics, seed=1):
+    motion = StepTest(count=2, dwell=0.3)
+    moved = respond(Plant(dynamics), motion, round(motion.duration / 1e-3), 1e-3)
+    n = len(moved.probe)
+    seen = moved.probe + np.random.default_rng(seed).normal(0.0, NOISE, n)
+    return Problem(moved.carriage, seen, np.ones(n, bool), 1e-3, np.ones((n, 1)), 300.0)
 
 
-def candidate(structure, sum_of_squares):
-    fit = fitted(structure, sum_of_squares)
-    return Candidate(fit, information(fit))
+def fitter(problem):
+    """How one structure is fitted to ``problem``, given the smaller ones."""
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    points = StartingPoints(problem, lag, HankelVote(np.empty(0), 0, np.empty(0, complex)))
+    return lambda structure, smaller: fit(problem, structure, points.of(structure, smaller))
+
+
+@lru_cache(maxsize=8)
+def explored(dynamics, at_least=0, forced=0):
+    return explore(fitter(problem_of(dynamics)), at_least, forced)
+
+
+def best(candidates):
+    return min(candidates, key=lambda c: c.bic)
+
+
+def distance(found, truth):
+    """Greatest relative difference of the responses up to 60 Hz."""
+    frequency = np.linspace(0.5, 60.0, 50)
+    return np.max(np.abs(found.response(frequency) / truth.response(frequency) - 1))
 
 
 def test_there_are_always_fewer_zeros_than_poles():
     for poles in range(1, 7):
         assert all(s.zeros < s.poles == poles for s in structures(poles))
+    assert structures(0) == [Structure(0, 0, True)]
 
 
-def test_information_charges_each_parameter_log_n():
-    small, large = Structure(1, 0, False), Structure(2, 0, False)
-    difference = information(fitted(large, 1.0)) - information(fitted(small, 1.0))
-    assert math.isclose(difference, math.log(1000))
+def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
+    """Of normal residuals with their own variance, but for a constant of n."""
+    small, *_, large = (c.fit for c in explored(PAIR))
+    n = small.samples
+    assert small.size < large.size
+
+    def likelihood(found):
+        variance = np.mean(found.residual**2)
+        density = -(found.residual**2) / (2 * variance) - 0.5 * np.log(2 * np.pi * variance)
+        return float(np.sum(density))
+
+    expected = 2 * (likelihood(small) - likelihood(large))
+    expected += (large.size - small.size) * math.log(n)
+    assert information(large) - information(small) == pytest.approx(expected, rel=1e-9)
+    dearer = information(large, 2.5) - information(small, 2.5)
+    charge = 1.5 * (large.size - small.size) * math.log(n)
+    assert dearer == pytest.approx(expected + charge, rel=1e-9)
 
 
-def test_the_chosen_one_contains_the_smallest_and_is_one_larger():
-    candidates = [
-        candidate(Structure(1, 0, False), 2.0),
-        candidate(Structure(2, 0, False), 1.0),
-        candidate(Structure(1, 0, True), 1.5),
-        candidate(Structure(2, 1, False), 0.999),
-        candidate(Structure(3, 2, True), 0.998),
-    ]
+@pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])
+def test_the_data_insist_on_as_many_poles_as_there_are(truth, poles):
+    smallest = best(explored(truth)).fit
+    assert smallest.structure.poles == poles
+    assert distance(smallest.dynamics, truth) < 0.01
+
+
+@pytest.mark.parametrize("truth", [FIRST_ORDER, PAIR, PAIR_AND_POLE])
+def test_the_chosen_one_contains_the_smallest_and_is_richer(truth):
+    candidates = explored(truth)
+    smallest = best(candidates).fit.structure
     chosen, scored = choose(candidates, lambda fit: 1.0)
-    assert chosen.fit.structure == Structure(2, 1, False)
+    assert chosen.fit.structure.contains(smallest)
+    assert chosen.fit.structure.size == max(smallest.size + 1, 3)
+    assert distance(chosen.fit.dynamics, truth) < 0.01
     assert sum(np.isfinite(c.held_out) for c in scored) == 2
+    assert [c.fit for c in scored] == [c.fit for c in candidates]
 
 
 def test_held_out_edges_veto_what_does_worse_on_them():
-    candidates = [candidate(Structure(2, 0, False), 1.0), candidate(Structure(2, 1, False), 0.999)]
-    chosen, _ = choose(candidates, lambda fit: 1.0 + 0.2 * fit.structure.zeros)
-    assert chosen.fit.structure == Structure(2, 0, False)
+    candidates = explored(PAIR)
+    smallest = best(candidates)
+    chosen, _ = choose(candidates, lambda fit: float(fit.size > smallest.fit.size) + 1.0)
+    assert chosen.fit is smallest.fit
+
+
+def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only():
+    problem = problem_of(PAIR)
+    held = np.arange(len(problem.seen)) > 0.6 * len(problem.seen)
+    by_poles = {c.fit.structure.poles: c.fit for c in explored(PAIR)}
+    assert held_out_rms(problem, by_poles[2], held) == pytest.approx(NOISE, rel=0.1)
+    assert held_out_rms(problem, by_poles[0], held) > 10 * NOISE
+    assert math.isnan(held_out_rms(problem, by_poles[2], np.zeros(len(held), bool)))
+    assert math.isnan(held_out_rms(problem, by_poles[2], np.ones(len(held), bool)))
+
+
+def test_what_was_held_out_did_not_teach_the_model():
+    """Of other values where it is held out, the same structure misses just those."""
+    problem = problem_of(PAIR)
+    held = np.arange(len(problem.seen)) > 0.6 * len(problem.seen)
+    shifted = replace(problem, seen=problem.seen + np.where(held, 1e-6, 0.0))
+    found = best(explored(PAIR)).fit
+    assert held_out_rms(shifted, found, held) == pytest.approx(1e-6, rel=0.01)
 
 
 def test_a_zero_on_a_pole_is_no_richer():
-    small = candidate(Structure(1, 0, False), 1.0)
-    dipole = candidate(Structure(2, 1, False), 0.9999)
-    dipole.fit.dynamics = TransferFunction([1.0, 1.0001e-2], [1.0, 1.1e-2, 1e-5])
-    assert cancels(dipole.fit.dynamics)
-    chosen, _ = choose([small, dipole], lambda fit: 1.0)
-    assert chosen.fit is small.fit
+    """A richer candidate is passed over once its zero cancels a pole."""
+    candidates = explored(FIRST_ORDER)
+    chosen, _ = choose(candidates, lambda fit: 1.0)
+    scaled = chosen.fit.scaled
+    dipole = TransferFunction([1.0, 1.0001e-2], [1.0, 1.1e-2, 1e-5])
+    assert cancels(dipole)
+
+    class Cancelling(type(chosen.fit)):
+        dynamics = dipole
+
+    spoiled = Cancelling(
+        scaled, chosen.fit.shape, chosen.fit.driven, chosen.fit.background, chosen.fit.residual
+    )
+    others = [Candidate(spoiled, c.bic) if c.fit is chosen.fit else c for c in candidates]
+    again, _ = choose(others, lambda fit: 1.0)
+    assert again.fit is not spoiled
 
 
-def test_poles_and_zeros_apart_do_not_cancel():
-    assert not cancels(TransferFunction([1.0, 5e-3], [1.0, 1.1e-2, 1e-5]))
+@pytest.mark.parametrize(("apart", "cancelling"), [(1e-4, True), (0.05, False)])
+def test_a_zero_cancels_a_pole_that_no_data_could_tell_from_it(apart, cancelling):
+    """Of either pole, wherever the other one lies."""
+    for pole, other in ((100.0, 1e4), (1e4, 100.0)):
+        poles = np.polynomial.polynomial.polymul([1.0, 1 / pole], [1.0, 1 / other])
+        zero = [1.0, 1 / (pole * (1 + apart))]
+        assert cancels(TransferFunction(np.array(zero), poles)) is cancelling
+
+
+def test_where_there_are_no_zeros_none_cancels():
     assert not cancels(TransferFunction([1.0], [1.0, 1.1e-2, 1e-5]))
 
 
-def costs(needed):
-    """A sum of squares that stops falling at ``needed`` poles."""
-
-    def fit_structure(structure, smaller):
-        return fitted(structure, 10.0 ** -min(structure.poles, needed))
-
-    return fit_structure
-
-
-def test_the_search_stops_two_poles_after_the_last_gain():
-    tried = explore(costs(3), 0, 0)
-    assert max(c.fit.structure.poles for c in tried) == 5
+@pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])
+def test_the_search_stops_two_poles_after_the_last_gain(truth, poles):
+    assert max(c.fit.structure.poles for c in explored(truth)) == poles + 2
 
 
 def test_the_search_goes_as_far_as_the_singular_values_ask():
-    tried = explore(costs(1), 5, 0)
-    assert max(c.fit.structure.poles for c in tried) >= 5
+    assert max(c.fit.structure.poles for c in explored(FIRST_ORDER, at_least=4)) == 5
 
 
 def test_a_forced_order_is_the_only_one():
-    tried = explore(costs(3), 0, 2)
-    assert {c.fit.structure.poles for c in tried} == {2}
+    assert {c.fit.structure.poles for c in explored(PAIR_AND_POLE, forced=2)} == {2}
 
 
 def test_hopeless_structures_are_not_fitted():
-    tried = explore(costs(0), 4, 0)
+    """Of four poles and more the largest structure gains nothing; so none of them can."""
+    tried = explored(FIRST_ORDER, at_least=4)
     assert sum(c.fit.structure.poles == 4 for c in tried) == 1
+
+
+def test_of_the_structures_fitted_none_that_could_win_is_left_out():
+    """Against fitting every structure there is."""
+    problem = problem_of(PAIR_AND_POLE)
+    fit_structure = fitter(problem)
+    every = []
+    for poles in range(5):
+        for structure in structures(poles):
+            every.append(fit_structure(structure, list(every)))
+    least = min(every, key=information)
+    assert best(explored(PAIR_AND_POLE)).fit.structure == least.structure

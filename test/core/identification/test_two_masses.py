@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass, fit_two_mass
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
@@ -32,7 +33,8 @@ def calibrated(collocated, mass):
 def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
     entry = calibrated(collocated, 10.0).certificate["two_mass"]
     assert entry["collocated"] is collocated
-    assert entry["misfit"] < 3.0
+    # Of two degrees of freedom; a right model is worse once in a thousand.
+    assert stats.chi2.sf(2 * entry["misfit"] ** 2, 2) > 1e-3
     assert entry["model"]["m1"] == 10.0
     assert entry["table_mass_kg"] == 10.0
     for name in FITTED:
@@ -90,7 +92,7 @@ def test_masses_do_not_explain_a_latency():
     assert found.certificate["two_mass"] is None
 
 
-def test_the_stated_uncertainty_is_the_scatter_of_repeated_fits():
+def test_stated_uncertainty_and_misfit_are_those_of_repeated_fits():
     found = calibrated(False, 10.0)
     lines = np.linspace(found.valid_up_to / 40, found.valid_up_to, 40)
     centre = MACHINE.non_collocated()
@@ -116,6 +118,11 @@ def test_the_stated_uncertainty_is_the_scatter_of_repeated_fits():
     stated = np.mean([fit.uncertainty for fit in fits], axis=0)
     # The scatter of 60 is known to 9 %: three of its sigmas.
     np.testing.assert_allclose(np.std(logs, axis=0), stated, rtol=0.28)
+    # Seven coefficients scatter, five things are fitted: χ² with two degrees of freedom each.
+    assert np.count_nonzero(np.diag(covariance)) == 7
+    misfit = sum(2 * fit.misfit**2 for fit in fits)
+    least, greatest = stats.chi2.ppf([1e-3, 1 - 1e-3], 2 * len(fits))
+    assert least < misfit < greatest
 
 
 @pytest.mark.parametrize("value", [0.0, -3.0, float("nan"), "heavy", True])
