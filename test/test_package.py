@@ -1,0 +1,79 @@
+"""package.xml is valid after REP 149 and names all that the package needs, and nothing else."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import omsm_ros
+
+ROOT = Path(omsm_ros.__file__).resolve().parent.parent
+# Python modules that are not ROS packages: what pip and what rosdep call them.
+ROSDEP = {
+    "numpy": ("numpy", "python3-numpy"),
+    "scipy": ("scipy", "python3-scipy"),
+    "matplotlib": ("matplotlib", "python3-matplotlib"),
+    "rosbags": ("rosbags", "python3-rosbags-pip"),
+    "serial": ("pyserial", "python3-serial"),
+    "yaml": ("PyYAML", "python3-yaml"),
+    "jinja2": ("jinja2", "python3-jinja2"),
+    "jsonschema": ("jsonschema", "python3-jsonschema"),
+    "tqdm": ("tqdm", "python3-tqdm"),
+    # rosdep has no keys for these; the README says how to install them.
+    "control": ("control", None),
+    "cobs": ("cobs", None),
+}
+
+
+def parsed(folder):
+    package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is not installed")
+    warnings = []
+    found = package.parse_package(str(folder / "package.xml"), warnings=warnings)
+    assert warnings == []
+    return found
+
+
+def imported(folder):
+    """Foreign top-level modules that the Python files below ``folder`` import."""
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module]
+            yield from (name.split(".")[0] for name in names)
+
+
+NEEDED = {*imported("omsm_ros"), *imported("launch")} - {*sys.stdlib_module_names, "omsm_ros"}
+
+
+@pytest.mark.parametrize("folder", [ROOT, ROOT / "msg_defs"], ids=["omsm_ros", "omsm_msgs"])
+def test_the_manifest_is_valid(folder):
+    package = parsed(folder)
+    package.validate()
+    assert package.package_format == 3
+    assert package.version == omsm_ros.__version__
+
+
+def test_the_manifest_names_all_that_is_imported_and_nothing_else():
+    declared = {dependency.name for dependency in parsed(ROOT).exec_depends}
+    needed = {ROSDEP[name][1] if name in ROSDEP else name for name in NEEDED}
+    assert declared == needed - {None}
+
+
+def test_what_is_built_against_is_also_there_at_run_time():
+    package = parsed(ROOT)
+    built = {dependency.name for dependency in package.build_depends}
+    assert built <= {dependency.name for dependency in package.exec_depends}
+
+
+def test_pip_installs_what_is_imported_and_not_ros():
+    lines = (ROOT / "bootstrap" / "runtime.in").read_text(encoding="utf-8").splitlines()
+    listed = {line.split(">")[0].split("<")[0].split("=")[0].strip() for line in lines if line}
+    assert listed == {ROSDEP[name][0] for name in NEEDED if name in ROSDEP}
+
+
+def test_the_readme_says_what_rosdep_cannot_install():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for name, key in ROSDEP.values():
+        assert key or f"`{name}`" in readme
