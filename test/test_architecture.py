@@ -18,6 +18,7 @@ LAYERS = [
     {"report", "storage", "devices", "emulators"},
     {"twin", "protocols"},
     {"core"},
+    {"quantities"},
     {"errors", "units", "sosfilt"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

@@ -20,6 +20,7 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import CalibrationError
+from omsm_ros.storage import strict_json
 from omsm_ros.units import NANOSECONDS_PER_S
 
 MAX_JSON_CHARACTERS = 1_000_000
@@ -127,13 +128,7 @@ def _json_object(name: str, text: str) -> dict[str, object]:
         raise CalibrationError(
             f"{name} of {len(text)} characters, at most {MAX_JSON_CHARACTERS} are accepted"
         )
-    try:
-        value = json.loads(text) if text else {}
-    except (ValueError, RecursionError) as err:
-        raise CalibrationError(f"{name} is not JSON: {err}") from err
-    if not isinstance(value, dict):
-        raise CalibrationError(f"{name} is {type(value).__name__}, expected a JSON object")
-    return value
+    return strict_json.object_of(text or "{}", CalibrationError, name)
 
 
 def cloud_array(message: Any) -> NDArray[np.void]:

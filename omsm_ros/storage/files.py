@@ -1,61 +1,114 @@
-"""Files that appear only when they are whole, and texts read up to a bound."""
+"""Regular files, read up to a bound; files that appear only when they are whole."""
 
 from __future__ import annotations
 
-import json
 import os
+import secrets
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from omsm_ros.errors import FileError
+from omsm_ros.storage import strict_json
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 """The files of a measurement."""
+
+
+# ------------------------------------------------------------------------------ reading
+
+
+def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
+    """Return the text of a regular file of at most ``limit`` bytes.
+
+    Raises ``error``, which calls the file ``what``, for anything else.
+    """
+    try:
+        with open_regular(path, error, what) as stream:
+            raw = stream.read(limit + 1)
+        if len(raw) <= limit:
+            return raw.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        raise error(f"{what} {str(path)!r} cannot be read as text: {said(err)}") from err
+    raise error(
+        f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "
+        "check the path"
+    )
+
+
+def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:
+    """Open a regular file for reading; ``error`` for a folder, a device, a pipe, or none at all."""
+    try:
+        # Without O_NONBLOCK the opening of a pipe waits for a writer that may never come.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError as err:
+        raise error(f"no {what} at {str(path)!r}; check the path") from err
+    except (OSError, ValueError) as err:
+        raise error(f"{what} {str(path)!r} cannot be read: {said(err)}; check the path") from err
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise error(
+            f"{what} {str(path)!r} cannot be read: it is no regular file but a folder, a device "
+            "or a pipe; give a file"
+        )
+    return os.fdopen(descriptor, "rb")
+
+
+def said(err: Exception) -> str:
+    """What an exception says, on one line and without the path that the message names already."""
+    text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
+    return " ".join(text.split())[:200] or type(err).__name__
+
+
+# ------------------------------------------------------------------------------ writing
 
 
 @contextmanager
 def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open ``path`` for writing under a temporary name; rename it when all went well.
 
-    FileError if it cannot be written there.
+    The temporary name cannot be foreseen, and nothing that exists is opened: neither a second
+    writer's file nor a link that somebody laid. FileError if it cannot be written there.
     """
     target = Path(path)
-    part = target.with_name(f".{target.name}.part")
+    part: Path | None = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        stream = part.open(mode)
-    except OSError as err:
-        raise FileError(f"cannot write {str(target)!r}: {err.strerror or err}") from err
-    try:
-        with stream:
+        if target.is_dir():
+            raise IsADirectoryError(None, "it is a folder")
+        part = beside(target)
+        with open(part, mode, opener=_new_file) as stream:
             yield stream
         os.replace(part, target)
+    except (OSError, ValueError) as err:
+        if isinstance(err, ValueError) and part is not None:
+            raise
+        raise FileError(
+            f"cannot write {str(target)!r}: {said(err)}; check the folder, its rights and its room"
+        ) from err
     finally:
-        part.unlink(missing_ok=True)
+        if part is not None:
+            part.unlink(missing_ok=True)
 
 
-def read_text(path: Path, limit: int, error: type[FileError], what: str) -> str:
-    try:
-        size = path.stat().st_size
-        if size > limit:
-            raise error(f"{what} {str(path)!r} has {size} bytes, at most {limit} are accepted")
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as err:
-        raise error(f"no {what} at {str(path)!r}; check the path") from err
-    except (OSError, UnicodeDecodeError) as err:
-        raise error(f"{what} {str(path)!r} cannot be read as text: {err}") from err
+def beside(target: Path) -> Path:
+    """A name that nobody can foresee, in the folder of ``target``."""
+    # Not made from the target's name, which may have all the characters that a name can have.
+    return target.with_name(f".{secrets.token_hex(8)}.part")
+
+
+def _new_file(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
 
 
 def save_text(path: Path | str, text: str) -> None:
     """Write a text file."""
-    with whole_file(path, "w") as stream:
-        stream.write(text)
+    with whole_file(path) as stream:
+        stream.write(text.encode("utf-8", "replace"))
 
 
 def save_json(path: Path | str, content: Mapping[str, object]) -> None:
-    """Write a JSON object for people and programs."""
-    with whole_file(path, "w") as stream:
-        json.dump(content, stream, indent=1, allow_nan=False)
-        stream.write("\n")
+    """Write a JSON object for people and programs; ValueError for what JSON cannot say."""
+    save_text(path, strict_json.text_of(content, indent=1) + "\n")

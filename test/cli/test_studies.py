@@ -132,10 +132,10 @@ def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
     ("text", "named"),
     [
         ("time_s,z_m\n0,1e-6\n", "two columns"),
-        ("time_s,z_m\n0,a\n1,b\n", "not a table"),
-        ("time_s,z_m\n0,1\n1,nan\n", "two columns"),
+        ("time_s,z_m\n0,a\n1,b\n", "no table"),
+        ("time_s,z_m\n0,1\n1,nan\n", r"z_m\[1\] is nan m"),
         ("time_s,z_m\n0,1\n1,1\n5,1\n", "even steps"),
-        ("time_s,z_m\n2,1\n1,1\n", "even steps"),
+        ("time_s,z_m\n2,1\n1,1\n", "step of time_s is -1.0 s"),
     ],
 )
 def test_a_wrong_motion_file_is_refused(tmp_path, text, named):

@@ -62,7 +62,9 @@ def _certificate(calibration: Calibration, polarity: int | None) -> list[str]:
     certificate = calibration.certificate
     found = []
     verdict = certificate.get("verdict")
-    if isinstance(verdict, str) and not verdict.startswith("accepted"):
+    if verdict is None:
+        found.append("its certificate states no verdict")
+    elif not str(verdict).startswith("accepted"):
         found.append(f"its certificate says {verdict!r}{_reasons(certificate)}")
     certified = certificate.get("polarity")
     if polarity is not None and certified is not None and certified != polarity:

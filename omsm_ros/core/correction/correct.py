@@ -26,6 +26,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatA
 from omsm_ros.core.samples.continuity import Arrival, TriggerCount
 from omsm_ros.core.samples.pairing import Pairing, Run
 from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
 
 SAME_PERIOD = 1e-6
@@ -58,14 +59,11 @@ class CorrectionOptions:
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
             raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
-        if self.static_gain is not None and not 0 < self.static_gain < np.inf:
-            raise ConfigurationError(f"static_gain {self.static_gain!r}, expected None or positive")
-        if not 0 < self.max_pending < np.inf:
-            raise ConfigurationError(f"max_pending {self.max_pending!r} s, expected positive")
-        if self.lateral_lag is not None and not 0 <= self.lateral_lag < np.inf:
-            raise ConfigurationError(
-                f"lateral_lag {self.lateral_lag!r} s, expected None, zero or a positive number"
-            )
+        if self.static_gain is not None:
+            GAIN.checked(self.static_gain, ConfigurationError, "static_gain")
+        if self.lateral_lag is not None:
+            LAG.checked(self.lateral_lag, ConfigurationError, "lateral_lag")
+        WAIT.checked(self.max_pending, ConfigurationError, "max_pending")
 
 
 class Corrector:
@@ -243,8 +241,6 @@ def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
     if options.lateral_lag is not None:
         return options.lateral_lag
     stated = calibration.settings.get("lag_is_latency", False)
-    if not isinstance(stated, bool):
-        raise CalibrationError(f"settings: lag_is_latency is {stated!r}, expected true or false")
     return max(calibration.dynamics.low_frequency_delay, 0.0) if stated else 0.0
 
 

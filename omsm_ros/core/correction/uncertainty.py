@@ -21,12 +21,17 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunct
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
+from omsm_ros.quantities import GAIN_UNCERTAINTY, TIME_UNCERTAINTY, UNCERTAINTY
 from omsm_ros.units import MICROMETRE_M
 
 # A direction of the covariance that adds less than this share of the variance is left out.
 _NEGLIGIBLE = 1e-6
 # Sensitivities are derivatives of the motion: each costs one order of the interpolation.
 _ORDER = 5
+
+
+# All others are lengths.
+_QUANTITIES = {"static_gain": GAIN_UNCERTAINTY, "lateral_lag": TIME_UNCERTAINTY}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +57,8 @@ class ErrorSources:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigurationError(
-                    f"uncertainty {field.name} is {value!r}, expected zero or a positive number"
-                )
+            quantity = _QUANTITIES.get(field.name, UNCERTAINTY)
+            quantity.checked(getattr(self, field.name), ConfigurationError, field.name)
 
     @classmethod
     def of(cls, calibration: Calibration) -> ErrorSources:
@@ -76,21 +78,14 @@ def sources_with(calibration: Calibration, stated: Mapping[str, object]) -> Erro
     Raises ConfigurationError for a name that is no source, or a value that is no uncertainty.
     """
     known = [field.name for field in fields(ErrorSources)]
-    for name, value in stated.items():
+    for name in stated:
         if name not in known:
             raise ConfigurationError(f"uncertainty {name!r} is unknown, expected of {known}")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ConfigurationError(f"uncertainty {name} is {value!r}, expected a number in SI")
     return replace(ErrorSources.of(calibration), **stated)  # type: ignore[arg-type]
 
 
 def _standard_uncertainty(certificate: Mapping[str, object], key: str) -> float:
-    value = certificate.get(key, 0.0)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
-        raise CalibrationError(
-            f"certificate: {key} is {value!r}, expected zero or a positive number"
-        )
-    return float(value)
+    return float(UNCERTAINTY.checked(certificate.get(key, 0.0), CalibrationError, key))
 
 
 def contributions(
@@ -193,16 +188,11 @@ def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> F
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """L with L Lᵀ = covariance, (p, rank); scaled first, for the variances span many decades.
-
-    Raises CalibrationError for a covariance with a negative eigenvalue.
-    """
+    """L with L Lᵀ = covariance, (p, rank); scaled first, for the variances span many decades."""
     deviations = np.sqrt(np.diag(covariance))
     free = np.flatnonzero(deviations)
     correlation = covariance[np.ix_(free, free)] / np.outer(deviations[free], deviations[free])
     values, vectors = np.linalg.eigh(correlation)
-    if len(values) and values[0] < -1e-6:
-        raise CalibrationError(f"covariance has a negative eigenvalue, {values[0]!r} (scaled)")
     factor = np.zeros((len(covariance), len(free)))
     factor[free] = deviations[free, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
     return factor

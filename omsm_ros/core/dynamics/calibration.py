@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from omsm_ros.core.dynamics import plausibility
 from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, OmsmError
+from omsm_ros.quantities import FREQUENCY, GAIN, SAMPLE_PERIOD
 
 SCHEMA = "omsm-calibration/1"
 REJECTED = "rejected"
@@ -45,24 +47,19 @@ class Calibration:
     certificate: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        GAIN.checked(self.static_gain, CalibrationError, "static_gain")
+        SAMPLE_PERIOD.checked(self.sample_period, CalibrationError, "sample_period")
+        FREQUENCY.checked(self.valid_up_to, CalibrationError, "valid_up_to")
         p = len(self.dynamics.numerator) + len(self.dynamics.denominator)
         if self.covariance.shape != (p, p) or not np.all(np.isfinite(self.covariance)):
             raise CalibrationError(
-                f"covariance of shape {self.covariance.shape!r}, expected ({p}, {p}) finite numbers"
+                f"covariance of shape {self.covariance.shape!r}, expected ({p}, {p}) finite "
+                "numbers; identify it again"
             )
-        scale = np.sqrt(np.outer(np.diag(self.covariance), np.diag(self.covariance)))
-        if np.any(np.diag(self.covariance) < 0) or np.any(
-            abs(self.covariance - self.covariance.T) > 1e-9 * scale
-        ):
-            raise CalibrationError("covariance is not symmetric with a diagonal of variances")
         if not self.dynamics.is_stable:
             raise CalibrationError(
-                f"G_m is unstable: poles {self.dynamics.poles()!r}; identify it again"
+                f"G_m is unstable: poles {self.dynamics.poles()!r} rad/s; identify it again"
             )
-        for name in ("static_gain", "sample_period", "valid_up_to"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise CalibrationError(f"{name} is {value!r}, expected a positive number")
 
     @property
     def low_frequency_delay_uncertainty(self) -> float:
@@ -86,7 +83,11 @@ class Calibration:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Calibration:
-        """The inverse of :meth:`content`, for values already checked against the schema."""
+        """The inverse of :meth:`content`, for values of the right types.
+
+        This is the door for calibrations, from a file or over the network: raises
+        CalibrationError for one that no machine has, or that cannot be computed with.
+        """
         try:
             dynamics = TransferFunction(
                 np.asarray(content["numerator"], np.float64),
@@ -95,17 +96,22 @@ class Calibration:
             )
         except OmsmError as err:
             raise CalibrationError(str(err)) from err
+        sample_period = float(content["sample_period"])
+        plausibility.check_dynamics(dynamics, sample_period)
+        plausibility.check_certificate(content["certificate"], content["settings"])
         p = len(dynamics.numerator) + len(dynamics.denominator)
         covariance = np.asarray(content["covariance"], np.float64)
-        return cls(
+        calibration = cls(
             dynamics=dynamics,
             static_gain=float(content["static_gain"]),
-            sample_period=float(content["sample_period"]),
+            sample_period=sample_period,
             valid_up_to=float(content["valid_up_to"]),
             covariance=covariance.reshape(p, p) if covariance.size == p * p else covariance,
             settings=content["settings"],
             certificate=content["certificate"],
         )
+        plausibility.check_covariance(calibration.covariance, dynamics, calibration.valid_up_to)
+        return calibration
 
     @cached_property
     def id(self) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, SLOPE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +36,8 @@ class Geometry:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not np.isfinite(value):
-                raise ConfigurationError(f"geometry: {field.name} is {value!r}, expected a number")
+            quantity = SLOPE if field.name.startswith("beam") else LENGTH
+            quantity.checked(getattr(self, field.name), ConfigurationError, field.name)
 
 
 class WorkpiecePoints(NamedTuple):

@@ -6,15 +6,26 @@ are SI; arrays are float64 of shape (n,) unless said otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import (
+    ACCELERATION,
+    ANGLE,
+    COUNTER,
+    DISTANCE,
+    POSITION,
+    SAMPLE_PERIOD,
+    STAMP,
+    Quantity,
+)
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -22,6 +33,12 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 # No device here delivers more in one message; a longer block is a forgery or a wrong unit.
 MAX_BLOCK_SAMPLES = 4_000_000
+
+
+# What is not plausible was not measured: it counts as lost.
+_AXES = {"x": POSITION, "y": POSITION, "z": POSITION, "b": ANGLE, "c": ANGLE}
+_DISTANCE = {"distance": DISTANCE}
+_ACCELERATION = dict.fromkeys("xyz", ACCELERATION)
 
 
 class Status(IntEnum):
@@ -59,23 +76,24 @@ class Block:
         """Samples in the block."""
         raise NotImplementedError
 
-    def _check(self, name: str, lengths: set[int]) -> None:
+    def _check(
+        self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
+    ) -> None:
         if len(lengths) != 1:
             raise DataError(f"{name}: channels of different lengths {sorted(lengths)!r}")
         (length,) = lengths
         if not 0 < length <= MAX_BLOCK_SAMPLES:
             raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")
-        if not (np.isfinite(self.sample_period) and self.sample_period > 0):
-            raise DataError(
-                f"{name}: sample_period {self.sample_period!r} s, expected a positive number"
-            )
-        if self.first_sample < 0:
-            raise DataError(f"{name}: first_sample {self.first_sample!r} is negative")
+        SAMPLE_PERIOD.checked(self.sample_period, DataError, f"{name}: sample_period")
+        COUNTER.checked(self.first_sample, DataError, f"{name}: first_sample")
+        STAMP.checked(self.stamp_ns, DataError, f"{name}: stamp")
+        for channel, quantity in channels.items():
+            object.__setattr__(self, channel, quantity.or_lost(getattr(self, channel)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisBlock(Block):
-    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,)."""
+    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,), NaN where it was lost."""
 
     x: FloatArray
     y: FloatArray
@@ -84,7 +102,8 @@ class AxisBlock(Block):
     c: FloatArray
 
     def __post_init__(self) -> None:
-        self._check("AxisBlock", {len(a) for a in (self.x, self.y, self.z, self.b, self.c)})
+        lengths = {len(a) for a in (self.x, self.y, self.z, self.b, self.c)}
+        self._check("AxisBlock", lengths, _AXES)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -104,7 +123,7 @@ class DistanceBlock(Block):
 
     def __post_init__(self) -> None:
         optional = {len(a) for a in (self.intensity, self.status) if len(a)}
-        self._check("DistanceBlock", {len(self.distance)} | optional)
+        self._check("DistanceBlock", {len(self.distance)} | optional, _DISTANCE)
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -118,14 +137,14 @@ class DistanceBlock(Block):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AccelerationBlock(Block):
-    """Acceleration x, y, z [m/s²], each of shape (n,)."""
+    """Acceleration x, y, z [m/s²], each of shape (n,), NaN where it was lost."""
 
     x: FloatArray
     y: FloatArray
     z: FloatArray
 
     def __post_init__(self) -> None:
-        self._check("AccelerationBlock", {len(a) for a in (self.x, self.y, self.z)})
+        self._check("AccelerationBlock", {len(a) for a in (self.x, self.y, self.z)}, _ACCELERATION)
 
     def __len__(self) -> int:
         return len(self.z)

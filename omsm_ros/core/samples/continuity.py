@@ -11,13 +11,10 @@ from collections import deque
 from dataclasses import dataclass
 
 from omsm_ros.core.samples.blocks import Block
-from omsm_ros.errors import DataError
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Devices count triggers in 32 bits.
 COUNTER_SPAN = 2**32
-# Beyond 2**63 a count would not fit into an index; no device gets near.
-_MAX_COUNT = 2**62
 # Messages are not delivered this late; time that falls back further has been set back.
 TIME_JUMP_S = 2.0
 # A count that wrapped goes on close to zero; a larger leap is a device that was reset.
@@ -51,14 +48,7 @@ class TriggerCount:
         self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS_REMEMBERED)
 
     def place(self, block: Block, length: int) -> Arrival:
-        """Place ``block`` of ``length`` samples after what came before.
-
-        Raises DataError for a count that no device reaches.
-        """
-        if block.first_sample > _MAX_COUNT:
-            raise DataError(
-                f"first_sample {block.first_sample!r} is not a trigger count, which is below 2**62"
-            )
+        """Place ``block`` of ``length`` samples after what came before."""
         first = self._unwrapped(block.first_sample)
         if self._begins_anew(first, block):
             self._session += 1

@@ -6,7 +6,7 @@ chuck, height along the spindle axis, all in metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import SurfaceError
+from omsm_ros.quantities import FOCAL_LENGTH, LENGTH, RADIUS
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +22,9 @@ class Flat:
     """A plane at constant ``level`` [m]."""
 
     level: float = 0.0
+
+    def __post_init__(self) -> None:
+        LENGTH.checked(self.level, SurfaceError, "level")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
@@ -34,8 +38,7 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.radius) or self.radius == 0:
-            raise SurfaceError(f"sphere radius {self.radius!r} m, expected a nonzero number")
+        RADIUS.checked(self.radius, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m]; NaN outside the sphere's equator."""
@@ -61,12 +64,8 @@ class OffAxisParaboloid:
     off_axis_distance: float
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.parent_focal_length) and self.parent_focal_length > 0):
-            raise SurfaceError(
-                f"parent_focal_length {self.parent_focal_length!r} m, expected a positive number"
-            )
-        if not np.isfinite(self.off_axis_distance):
-            raise SurfaceError(f"off_axis_distance {self.off_axis_distance!r} m is not finite")
+        FOCAL_LENGTH.checked(self.parent_focal_length, SurfaceError, "parent_focal_length")
+        LENGTH.checked(self.off_axis_distance, SurfaceError, "off_axis_distance")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
@@ -84,26 +83,9 @@ PAPER_MIRROR = OffAxisParaboloid(parent_focal_length=25.4e-3, off_axis_distance=
 
 PAPER_MIRROR_RADIUS_M = 12.7e-3
 
-_SHAPES: dict[str, type[Flat] | type[Sphere] | type[OffAxisParaboloid]] = {
+SHAPES: dict[str, Callable[..., Surface]] = {
     "flat": Flat,
     "sphere": Sphere,
     "off_axis_paraboloid": OffAxisParaboloid,
 }
-
-
-def surface_from_description(description: Mapping[str, object]) -> Surface:
-    """Build a surface from ``{"shape": name, parameter: metres, …}``.
-
-    Raises SurfaceError naming an unknown shape, or an unknown, missing or non-numeric parameter.
-    """
-    parameters = dict(description)
-    shape = parameters.pop("shape", None)
-    if not isinstance(shape, str) or shape not in _SHAPES:
-        raise SurfaceError(f"shape {shape!r} is unknown, expected one of {sorted(_SHAPES)}")
-    for name, value in parameters.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise SurfaceError(f"{shape}: {name} is {value!r}, expected a number in metres")
-    try:
-        return _SHAPES[shape](**parameters)  # type: ignore[arg-type]
-    except TypeError as err:
-        raise SurfaceError(f"{shape}: {err}".replace("__init__() ", "")) from err
+"""The surfaces by the name that a description gives their ``shape``."""

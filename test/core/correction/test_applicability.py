@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def calibration(**certificate: object) -> Calibration:
         valid_up_to=100.0,
         covariance=np.zeros((3, 3)),
         settings=SETTINGS,
-        certificate=certificate,
+        certificate={"verdict": "accepted"} | certificate,
     )
 
 
@@ -34,6 +35,11 @@ def test_the_same_settings_raise_no_objection() -> None:
 
 def test_what_is_not_asked_is_not_objected_to() -> None:
     assert objections(calibration()) == ()
+
+
+def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
+    unjudged = replace(calibration(), certificate={})
+    assert objections(unjudged) == ("its certificate states no verdict",)
 
 
 @pytest.mark.parametrize(

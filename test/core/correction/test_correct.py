@@ -434,8 +434,6 @@ def test_latency_is_assumed_only_where_it_is_known() -> None:
     assert lateral_lag(CALIBRATION, CorrectionOptions()) == 0.0
     assert lateral_lag(late, CorrectionOptions()) == pytest.approx(lag)
     assert lateral_lag(late, CorrectionOptions(lateral_lag=0.0)) == 0.0
-    with pytest.raises(CalibrationError, match="lag_is_latency is 'yes'"):
-        lateral_lag(calibration(settings={"lag_is_latency": "yes"}), CorrectionOptions())
 
 
 def test_a_late_probe_looks_where_the_spindle_was(quiet_scan: Recording) -> None:

@@ -8,7 +8,6 @@ import pytest
 
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.core.samples.continuity import COUNTER_SPAN, Arrival, TriggerCount
-from omsm_ros.errors import DataError
 
 
 def block(first: int, stamp_s: float) -> Block:
@@ -112,8 +111,3 @@ def test_after_an_end_everything_is_new(stream: Stream) -> None:
     stream(0, 0.0)
     stream.sequence.end()
     assert stream(100, 0.1) == Arrival(1, 100, 0, 0)
-
-
-def test_a_count_that_no_device_reaches_is_refused(stream: Stream) -> None:
-    with pytest.raises(DataError, match="18446744073709551615"):
-        stream(2**64 - 1, 0.0)

@@ -6,7 +6,6 @@ from omsm_ros.core.surface.nominal import (
     Flat,
     OffAxisParaboloid,
     Sphere,
-    surface_from_description,
 )
 from omsm_ros.errors import SurfaceError
 
@@ -43,32 +42,17 @@ def test_flat_is_flat():
     np.testing.assert_array_equal(Flat(2.0).height(X, Y), np.full(500, 2.0))
 
 
-def test_description_builds_the_surface_it_names():
-    text = {
-        "shape": "off_axis_paraboloid",
-        "parent_focal_length": 0.0254,
-        "off_axis_distance": 0.0508,
-    }
-    assert surface_from_description(text) == PAPER_MIRROR
-
-
 @pytest.mark.parametrize(
-    ("description", "named"),
+    ("shape", "named"),
     [
-        ({}, "None"),
-        ({"shape": "cube"}, "cube"),
-        ({"shape": ["sphere"]}, "unknown"),
-        ({"shape": "sphere"}, "radius"),
-        ({"shape": "sphere", "radius": "100 mm"}, "100 mm"),
-        ({"shape": "sphere", "radius": True}, "radius"),
-        ({"shape": "sphere", "radius": 0.0}, "radius"),
-        ({"shape": "sphere", "radius": 1.0, "colour": 2}, "colour"),
-        (
-            {"shape": "off_axis_paraboloid", "parent_focal_length": -1.0, "off_axis_distance": 0},
-            "-1.0",
-        ),
+        (lambda: Sphere(0.0), "radius is 0.0 m"),
+        (lambda: Sphere(1e300), "radius"),
+        (lambda: Sphere(np.nan), "radius"),
+        (lambda: Flat(np.inf), "level"),
+        (lambda: OffAxisParaboloid(-1.0, 0.0), "parent_focal_length is -1.0 m"),
+        (lambda: OffAxisParaboloid(1.0, 1e6), "off_axis_distance"),
     ],
 )
-def test_a_wrong_description_is_refused_by_name(description, named):
+def test_a_surface_that_nobody_makes_is_refused_by_name(shape, named):
     with pytest.raises(SurfaceError, match=named):
-        surface_from_description(description)
+        shape()

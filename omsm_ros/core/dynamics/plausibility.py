@@ -1,0 +1,134 @@
+"""Can a machine have these dynamics, and can they be computed with?
+
+A calibration comes from a file or over the network. Numbers that no machine has (a delay of
+minutes, a pole in a million years) would not only be wrong: filters made of them take all memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import CalibrationError
+from omsm_ros.quantities import DELAY, ORDER, SAMPLE_PERIOD, TIME_CONSTANT, shown
+
+# G_m(0) = 1 by definition; rounding of the coefficients leaves far less than this.
+_UNIT_GAIN = 1e-6
+# A wrong start is forgotten to 1e-9 after 21 time constants: some six million samples.
+MAX_TIME_CONSTANT_SAMPLES = 300_000
+# The filter has a section for two samples of delay, and each costs time for every sample.
+MAX_DELAY_SAMPLES = 10_000
+# Uncertainty of the response at the end of its trusted band that a coefficient alone may bring.
+_MAX_UNCERTAINTY = 1e9
+# Rounding makes a semidefinite correlation matrix this little indefinite.
+_INDEFINITE = 1e-6
+
+
+def check_dynamics(dynamics: TransferFunction, sample_period: float) -> None:
+    """Raise CalibrationError for a G_m that no machine sampled every ``sample_period`` [s] has.
+
+    Whether it is stable is the calibration's own question.
+    """
+    SAMPLE_PERIOD.checked(sample_period, CalibrationError, "sample_period")
+    ORDER.checked(len(dynamics.denominator) - 1, CalibrationError, "order of the denominator")
+    if abs(dynamics.dc_gain - 1) > _UNIT_GAIN:
+        raise CalibrationError(
+            f"G_m(0), the first coefficient of the numerator, is {dynamics.dc_gain!r}, expected 1; "
+            "the gain at rest belongs into static_gain; identify it again"
+        )
+    DELAY.checked(dynamics.delay, CalibrationError)
+    _check_samples("delay", dynamics.delay, sample_period, MAX_DELAY_SAMPLES)
+    poles = _roots(dynamics, "poles")
+    for roots in (poles, _roots(dynamics, "zeros")):
+        for rate in abs(roots):
+            TIME_CONSTANT.checked(_inverse(rate), CalibrationError, "time constant of G_m")
+    if len(poles):
+        slowest = _inverse(np.min(abs(poles.real)))
+        TIME_CONSTANT.checked(slowest, CalibrationError, "slowest decay of G_m")
+        _check_samples("slowest decay", slowest, sample_period, MAX_TIME_CONSTANT_SAMPLES)
+
+
+def check_covariance(covariance: FloatArray, dynamics: TransferFunction, trusted: float) -> None:
+    """Raise CalibrationError unless this is the covariance of the parameters of ``dynamics``.
+
+    covariance: (p, p), order numerator, denominator[1:], delay
+    trusted: highest frequency at which the response is trusted [Hz]
+    """
+    variance = np.diag(covariance)
+    if np.any(variance < 0):
+        raise CalibrationError("covariance has a negative variance; identify it again")
+    deviation = np.sqrt(variance)
+    scale = deviation[:, np.newaxis] * deviation
+    if np.any(abs(covariance - covariance.T) > 1e-9 * scale):
+        raise CalibrationError("covariance is not symmetric; identify it again")
+    free = np.flatnonzero(np.diag(scale))
+    correlation = (covariance / np.where(scale > 0, scale, 1.0))[np.ix_(free, free)]
+    least = float(np.min(np.linalg.eigvalsh(correlation), initial=0.0))
+    if least < -_INDEFINITE or np.any(covariance[scale == 0] != 0):
+        raise CalibrationError(
+            f"covariance has a negative eigenvalue, {least:.2g} of its correlations: "
+            "no quantities vary together like that; identify it again"
+        )
+    _check_size(deviation, dynamics, trusted)
+
+
+def check_certificate(certificate: Mapping[str, object], settings: Mapping[str, object]) -> None:
+    """Raise CalibrationError for a verdict or a setting that others would take for another."""
+    verdict = certificate.get("verdict", "")
+    if not isinstance(verdict, str):
+        raise CalibrationError(
+            f"certificate: verdict is {shown(verdict)}, expected 'accepted' or 'rejected'; "
+            "identify it again"
+        )
+    for name in ("reasons", "warnings"):
+        texts = certificate.get(name, [])
+        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+            raise CalibrationError(
+                f"certificate: {name} is {shown(texts)}, expected a list of texts; identify again"
+            )
+    stated = settings.get("lag_is_latency", False)
+    if not isinstance(stated, bool):
+        raise CalibrationError(
+            f"settings: lag_is_latency is {shown(stated)}, expected true or false"
+        )
+
+
+def _inverse(rate: float) -> float:
+    return 1 / float(rate) if rate else np.inf
+
+
+def _check_samples(name: str, seconds: float, sample_period: float, most: int) -> None:
+    if seconds > most * sample_period:
+        raise CalibrationError(
+            f"{name} of G_m is {seconds:.4g} s, {seconds / sample_period:.3g} samples of "
+            f"{sample_period:.4g} s; expected at most {most}; identify it again"
+        )
+
+
+def _roots(dynamics: TransferFunction, kind: str) -> ComplexArray:
+    with np.errstate(all="ignore"):
+        try:
+            roots = dynamics.poles() if kind == "poles" else dynamics.zeros()
+        except (np.linalg.LinAlgError, ZeroDivisionError, OverflowError):
+            roots = np.array([np.nan + 0j])
+    if not np.all(np.isfinite(roots)):
+        raise CalibrationError(
+            f"the {kind} of G_m cannot be computed: its coefficients span too many decades; "
+            "identify it again"
+        )
+    return roots
+
+
+def _check_size(deviation: FloatArray, dynamics: TransferFunction, trusted: float) -> None:
+    omega = 2 * np.pi * trusted
+    powers = [*range(len(dynamics.numerator)), *range(1, len(dynamics.denominator)), 1]
+    with np.errstate(over="ignore"):
+        at_end = deviation * omega ** np.array(powers, np.float64)
+    if np.any(~(at_end <= _MAX_UNCERTAINTY)):
+        raise CalibrationError(
+            f"covariance leaves the response at {trusted:.4g} Hz uncertain by a factor of "
+            f"{float(np.max(at_end)):.2g}; identify it again"
+        )

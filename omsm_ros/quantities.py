@@ -1,0 +1,169 @@
+"""What may come from outside: every quantity with its name, unit and plausible range.
+
+A number enters the package through one door (a message, a bag, JSON, YAML, CSV, a parameter, an
+argument) and is held against this table there, once. A range is wide enough for any machine that
+this package could serve, and narrow enough that whatever is computed from it stays finite and
+fits into memory. What lies outside is a wrong unit, a damaged file or a forgery.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import DataError, OmsmError
+
+_SHOWN_CHARACTERS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number with a meaning.
+
+    name: as people read it;  unit: SI, empty for a pure number
+    low, high: the plausible range, both included
+    whole: an integer;  signed: the range is that of the magnitude, either sign may stand before it
+    remedy: what to do about a number outside
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    remedy: str = "check its unit"
+    whole: bool = False
+    signed: bool = False
+
+    def checked(self, value: object, error: type[OmsmError] = DataError, name: str = "") -> Any:
+        """Return ``value`` as float, or as int if ``whole``; raise ``error`` if it is implausible.
+
+        name: what the value is called where it came from; empty takes the quantity's own name.
+        """
+        if type(value) is (int if self.whole else float) and self.low <= value <= self.high:  # type: ignore[operator]
+            return value  # what nearly all values are, without further ado
+        number = _number(value, self.whole)
+        if number is None or not self._holds(number):
+            raise error(self._refusal(value, name))
+        return number
+
+    def checked_all(
+        self, values: NDArray[Any], error: type[OmsmError] = DataError, name: str = ""
+    ) -> NDArray[Any]:
+        """Return an array (n,) of plausible numbers; raise ``error`` naming the first other one."""
+        good = self._plausible(values)
+        if good is not None:
+            place = int(np.argmin(good))
+            raise error(self._refusal(values[place].item(), f"{name or self.name}[{place}]"))
+        return values
+
+    def or_lost(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return an array (n,) with NaN, which means "lost", where a number is not plausible.
+
+        A single corrupt reading must not cost the scan that it is in; it is counted as invalid.
+        """
+        good = self._plausible(values)
+        return values if good is None else np.where(good, values, np.nan)
+
+    def _plausible(self, values: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """True where a number lies in the range, or None if all do."""
+        # One fast pass proves most arrays: no element exceeds the root of the sum of squares.
+        if self.low == -self.high and float(np.vdot(values, values)) <= self.high * self.high:
+            return None
+        good = (values >= self.low) & (values <= self.high)
+        return None if np.all(good) else np.asarray(good, np.bool_)
+
+    def _holds(self, number: float) -> bool:
+        return self.low <= (abs(number) if self.signed else number) <= self.high
+
+    def _refusal(self, value: object, name: str) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        kind = "a whole number" if self.whole else "a number"
+        sign = "±" if self.signed else ""
+        return (
+            f"{name or self.name} is {shown(value)}{unit}, expected {kind} from "
+            f"{sign}{self.low:g} to {sign}{self.high:g}{unit}; {self.remedy}"
+        )
+
+
+def _number(value: object, whole: bool) -> float | int | None:
+    """The value as a number, or None if it is none."""
+    if isinstance(value, bool | np.bool_):
+        return None
+    if isinstance(value, int | np.integer):
+        # An integer of hundreds of digits has no float.
+        if whole:
+            return int(value)
+        return float(value) if abs(int(value)) < 2**63 else None
+    if isinstance(value, float | np.floating) and math.isfinite(value):
+        if not whole:
+            return float(value)
+        return int(value) if float(value).is_integer() else None
+    return None
+
+
+def shown(value: object) -> str:
+    """A foreign value in a message: on one line, and no longer than a reader can bear."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a nest of lists
+        text = f"a {type(value).__name__} too large to print"
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+
+
+# ------------------------------------------------------------------------- sampled data
+
+SAMPLE_PERIOD = Quantity("sample period", "s", 1e-7, 10.0, "give it in seconds")
+# Beyond it a float no longer tells neighbours apart; at 1 MHz it lasts 285 years.
+COUNTER = Quantity("trigger counter", "", 0, 2**53, "the device's counter is corrupt", whole=True)
+# ROS time has 32 bits of seconds.
+_MAX_STAMP_NS = 2**31 * 10**9
+STAMP = Quantity(
+    "stamp", "ns", -_MAX_STAMP_NS, _MAX_STAMP_NS, "set the clock of the sender", whole=True
+)
+POSITION = Quantity("position", "m", -100.0, 100.0, "give it in metres")
+DISTANCE = Quantity("distance", "m", -100.0, 100.0, "give it in metres")
+# A spindle's angle is counted on over its turns: a year at 30 rpm makes 1e8 rad.
+ANGLE = Quantity("angle", "rad", -1e9, 1e9, "give it in radians")
+ACCELERATION = Quantity("acceleration", "m/s²", -1e6, 1e6, "give it in m/s²")
+TIME = Quantity("time", "s", -1e10, 1e10, "give it in seconds")
+# A minute at 20 kHz waits in a quarter of a gigabyte.
+WAIT = Quantity("waiting time", "s", 1e-3, 60.0, "give it in seconds")
+DURATION = Quantity("duration", "s", 0.0, 1e7, "give it in seconds; 0 = all")
+
+# ------------------------------------------------------------------------------ dynamics
+
+DELAY = Quantity("delay", "s", 0.0, 1.0, "identify again; the loop's delay is milliseconds")
+# Drift over minutes is no dynamics of a servo; a nanosecond is beyond every sensor.
+TIME_CONSTANT = Quantity("time constant", "s", 1e-10, 1000.0, "identify again")
+FREQUENCY = Quantity("frequency", "Hz", 1e-6, 1e9, "give it in hertz")
+# Coefficients of s^k are these powers of time; beyond them their products overflow.
+GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and probe")
+ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
+
+# ------------------------------------------------------------------- machine and surface
+
+LENGTH = Quantity("length", "m", -10.0, 10.0, "give it in metres")
+RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if convex", signed=True)
+FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
+SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
+STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
+
+# --------------------------------------------------------------------------- uncertainty
+
+UNCERTAINTY = Quantity("standard uncertainty", "m", 0.0, 10.0, "give it in metres, k = 1")
+TIME_UNCERTAINTY = Quantity("standard uncertainty", "s", 0.0, 1.0, "give it in seconds, k = 1")
+GAIN_UNCERTAINTY = Quantity("standard uncertainty", "", 0.0, 1e6, "give it as a share, k = 1")
+BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2")
+LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
+
+# ------------------------------------------------------------------- arguments, parameters
+
+COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
+SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
+TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
+PROBABILITY = Quantity("probability", "", 0.0, 1.0, "give a share between 0 and 1")
+SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")

@@ -1,0 +1,61 @@
+"""The form of a foreign object: its names and types, by JSON schema.
+
+Ranges are not in the schemas: the record that is made of the object holds each quantity against
+the one table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jsonschema
+
+from omsm_ros.errors import OmsmError
+from omsm_ros.quantities import shown
+
+NUMBER: Mapping[str, Any] = {"type": "number"}
+
+
+def form(properties: Mapping[str, Any], required: Sequence[str]) -> dict[str, Any]:
+    """Return the schema of an object with ``properties`` and no others."""
+    return {
+        "type": "object",
+        "properties": dict(properties),
+        "additionalProperties": False,
+        "required": list(required),
+    }
+
+
+def check_form(
+    content: Mapping[str, Any], schema: Mapping[str, Any], error: type[OmsmError], what: str
+) -> None:
+    """Raise ``error``, which calls the content ``what``, unless it follows ``schema``."""
+    found = next(jsonschema.Draft202012Validator(schema).iter_errors(content), None)
+    if found is not None:
+        raise error(f"{what}: {_said(found)}")
+
+
+def _said(found: jsonschema.ValidationError) -> str:
+    place = found.json_path.removeprefix("$").removeprefix(".")
+    said = f"{place} is {shown(found.instance)}" if place else ""
+    wanted = found.validator_value
+    match found.validator:
+        case "additionalProperties":
+            known = sorted(found.schema["properties"])  # type: ignore[index, call-overload]
+            unknown = next(name for name in found.instance if name not in known)  # type: ignore[union-attr]
+            return f"{shown(unknown)} is unknown, expected of {known}"
+        case "required":
+            missing = [name for name in wanted if name not in found.instance]  # type: ignore[operator, union-attr]
+            return f"{missing[0]} is required and missing"
+        case "type":
+            kind = {"object": "names and values", "array": "a list"}.get(str(wanted), f"a {wanted}")
+            return f"{said}, expected {kind}"
+        case "const":
+            return f"{said}, expected {wanted!r}"
+        case "enum":
+            return f"{said}, expected one of {wanted!r}"
+        case "maxItems" | "minItems":
+            limit = "at most" if found.validator == "maxItems" else "at least"
+            return f"{place} has {len(found.instance)} values, expected {limit} {wanted}"  # type: ignore[arg-type]
+    return f"{place}: {found.message[:200]}"
