@@ -6,6 +6,7 @@ import numpy as np
 from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.least_squares import unit_columns
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -77,9 +78,8 @@ def parameter_covariance(
         noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
     weighted = (weight * noise)[:, np.newaxis] * spectrum
     meat = np.real(np.conj(spectrum).T @ weighted) / length
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    values, directions = np.linalg.eigh((columns / scale).T @ (columns / scale))
+    unit, scale = unit_columns(columns)
+    values, directions = np.linalg.eigh(unit.T @ unit)
     least = _RANK_TOLERANCE * float(values[-1])
     strong, weak = directions[:, values > least], directions[:, values <= least]
     bread = strong / values[values > least] @ strong.T
@@ -90,7 +90,7 @@ def parameter_covariance(
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def gain_apart(problem: Problem, fitted: Fit) -> float:
+def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
     """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
     every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
     return float(np.sqrt(every[0, 0]) / abs(fitted.gain))

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from omsm_ros.core.fitting.least_squares import orthonormal
 from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.samples.blocks import FloatArray
 
 # χ² a column must explain to be taken: four sigma.
 _CLEARLY_SHOWN = 16.0
@@ -20,7 +20,7 @@ _OVER = 10.0
 _SPANNED = 1e-6
 
 
-def still_decays(
+def starts_ringing(
     problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
 ) -> bool:
     """True if free decays of the poles of ``fitted`` reach into the samples that count.
@@ -29,26 +29,18 @@ def still_decays(
     colour: power of the noise at low frequency over its mean, by which chance explains more
     """
     counted = np.flatnonzero(problem.used)
-    if problem.starts_moving or fitted.structure.poles == 0 or len(counted) == 0:
+    if problem.fits_initial_condition or fitted.structure.poles == 0 or len(counted) == 0:
         return False
     first = float(counted[0]) * problem.period
     if float(np.min(-fitted.dynamics.poles().real)) * first > _OVER:
         return False
     if not at_rest:
         return True
-    columns = problem.free_decays(fitted)[problem.used]
+    columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit has already taken of a decay what the parameters of the model can imitate.
     known = problem.sensitivity(fitted)
-    basis = _orthonormal(np.column_stack([columns, known]))
+    basis = orthonormal(np.column_stack([columns, known]), _SPANNED)
     explained = float(np.sum((basis.T @ fitted.residual) ** 2))
     rest = fitted.sum_of_squares - explained
     size = basis.shape[1] - known.shape[1]
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
-
-
-def _orthonormal(columns: FloatArray) -> FloatArray:
-    """Basis (k, r) of what ``columns`` (k, q) span, whatever their units."""
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    left, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
-    return np.asarray(left[:, values > _SPANNED * values[0]])

@@ -55,46 +55,46 @@ class Structure:
 class Scaled:
     """A structure with ``s`` in units of ``rate`` [rad/s], which keeps coefficients near 1.
 
-    Its *shape* ψ (n + delay,) holds α of each section, β of each pair, and the delay; the
-    numerator (m+1,) is apart, for it enters a fit linearly.
+    Its *nonlinear parameters* ψ (n + delay,) hold α of each section, β of each pair, and the
+    delay. The numerator (m+1,) is not among them, for it enters a fit linearly.
     """
 
     structure: Structure
     rate: float
 
     @property
-    def shape_size(self) -> int:
+    def nonlinear_size(self) -> int:
         """Number of entries of ψ."""
         return self.structure.poles + self.structure.delay
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Box of ψ: any pole from far below to far above ``rate``; delay ≥ 0."""
-        lower = np.full(self.shape_size, -_LOG_RANGE)
-        upper = np.full(self.shape_size, _LOG_RANGE)
+        lower = np.full(self.nonlinear_size, -_LOG_RANGE)
+        upper = np.full(self.nonlinear_size, _LOG_RANGE)
         if self.structure.delay:
             lower[-1], upper[-1] = 0.0, np.inf
         return lower, upper
 
-    def sections(self, shape: FloatArray) -> list[FloatArray]:
+    def sections(self, nonlinear: FloatArray) -> list[FloatArray]:
         """Ascending factors of the denominator, [1, d1, d2] for a pair or [1, d1]."""
-        alpha, beta = self._logs(shape)
+        alpha, beta = self._logs(nonlinear)
         return [
             np.exp(np.concatenate([np.zeros(1), alpha[i : i + 1], beta[i : i + 1]]))
             for i in range(len(alpha))
         ]
 
-    def _logs(self, shape: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _logs(self, nonlinear: FloatArray) -> tuple[FloatArray, FloatArray]:
         singles = self.structure.poles - self.structure.pairs
-        return shape[:singles], shape[singles : self.structure.poles]
+        return nonlinear[:singles], nonlinear[singles : self.structure.poles]
 
-    def _delay(self, shape: FloatArray) -> float:
-        return float(shape[-1]) if self.structure.delay else 0.0
+    def _delay(self, nonlinear: FloatArray) -> float:
+        return float(nonlinear[-1]) if self.structure.delay else 0.0
 
-    def lag(self, shape: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """e^{-τs} / denominator (k,), and d ln of it / dψ (len ψ, k), at scaled ``s`` (k,)."""
         denominator = np.ones_like(s)
         first, second = [], []
-        for section in self.sections(shape):
+        for section in self.sections(nonlinear):
             value = 1 + section[1] * s
             if len(section) == 3:
                 square = section[2] * s * s
@@ -104,28 +104,28 @@ class Scaled:
             denominator = denominator * value
         tail = [-s] if self.structure.delay else []
         relative = np.array(first + second + tail, np.complex128)
-        return np.exp(-self._delay(shape) * s) / denominator, relative.reshape(-1, len(s))
+        return np.exp(-self._delay(nonlinear) * s) / denominator, relative.reshape(-1, len(s))
 
-    def transfer_function(self, shape: FloatArray, numerator: FloatArray) -> TransferFunction:
+    def transfer_function(self, nonlinear: FloatArray, numerator: FloatArray) -> TransferFunction:
         """G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
         denominator: FloatArray = np.ones(1)
-        for section in self.sections(shape):
+        for section in self.sections(nonlinear):
             denominator = np.asarray(polynomial.polymul(denominator, section), np.float64)
         return TransferFunction(
             numerator / self.rate ** np.arange(len(numerator)),
             denominator / self.rate ** np.arange(len(denominator)),
-            self._delay(shape) / self.rate,
+            self._delay(nonlinear) / self.rate,
         )
 
-    def coefficient_jacobian(self, shape: FloatArray) -> FloatArray:
+    def coefficient_jacobian(self, nonlinear: FloatArray) -> FloatArray:
         """d(numerator, denominator[1:], delay)/d(numerator[1:], ψ), SI over scaled.
 
         Shape (m+1 + n + 1, m + len ψ); the row of numerator[0] = 1 is zero.
         """
         zeros, poles = self.structure.zeros, self.structure.poles
-        jacobian = np.zeros((zeros + poles + 2, zeros + self.shape_size))
+        jacobian = np.zeros((zeros + poles + 2, zeros + self.nonlinear_size))
         jacobian[1 : zeros + 1, :zeros] = np.eye(zeros)
-        sections = self.sections(shape)
+        sections = self.sections(nonlinear)
         for column in range(poles):
             pair, power = (column, 1) if column < len(sections) else (column - len(sections), 2)
             product: FloatArray = np.zeros(power + 1)
@@ -138,7 +138,7 @@ class Scaled:
         powers = np.concatenate([np.arange(zeros + 1.0), np.arange(1.0, poles + 1), [1.0]])
         return self.rate ** -powers[:, np.newaxis] * jacobian
 
-    def shape_of(self, poles: ComplexArray, delay: float) -> FloatArray:
+    def nonlinear_of(self, poles: ComplexArray, delay: float) -> FloatArray:
         """ψ of given stable scaled ``poles`` (n,), conjugates included, and ``delay``."""
         sections = [(-2 * p.real / abs(p) ** 2, abs(p) ** -2) for p in poles if p.imag > 0]
         real = sorted((p.real for p in poles if p.imag == 0), key=abs)

@@ -153,6 +153,6 @@ def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
     rest, unseen = problem.used & ~held, problem.used & held
     if not (np.any(rest) and np.any(unseen)):
         return float("nan")
-    without = fit(replace(problem, used=rest), fitted.structure, [fitted.shape])
-    missed = problem.seen[unseen] - problem.output(without)[unseen]
+    without = fit(replace(problem, used=rest), fitted.structure, [fitted.nonlinear])
+    missed = problem.output[unseen] - problem.modelled(without)[unseen]
     return float(np.sqrt(np.mean(missed**2)))

@@ -23,7 +23,7 @@ _MAX_HANKEL_COLUMNS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class HankelVote:
+class OrderEstimate:
     """What the singular values say; empty where the data were too few.
 
     singular_values: in units of the largest that noise alone would give
@@ -35,16 +35,16 @@ class HankelVote:
     poles: ComplexArray
 
 
-def hankel_vote(
+def estimate_order(
     motion: FloatArray, deviation: FloatArray, used: BoolArray, period: float
-) -> HankelVote:
+) -> OrderEstimate:
     """States between the increments of ``motion`` and its ``deviation`` from static, all (n,).
 
     The deviation (G - 1) u vanishes for a motion at rest, so increments as input have
     the same poles as G, and neither level nor offset of either signal matters.
     """
     rows = int(np.clip(round(_HANKEL_SPAN_S / period / 2), *_HANKEL_ROWS))
-    empty = HankelVote(np.empty(0), 0, np.empty(0, np.complex128))
+    empty = OrderEstimate(np.empty(0), 0, np.empty(0, np.complex128))
     if len(motion) <= 2 * rows + 1:
         return empty
     steps = np.diff(motion, prepend=motion[0])
@@ -60,7 +60,7 @@ def hankel_vote(
     return _subspace(inputs, outputs, rows, period)
 
 
-def _subspace(inputs: FloatArray, outputs: FloatArray, rows: int, period: float) -> HankelVote:
+def _subspace(inputs: FloatArray, outputs: FloatArray, rows: int, period: float) -> OrderEstimate:
     stacked = np.concatenate(
         [inputs[:, rows:], inputs[:, :rows], outputs[:, :rows], outputs[:, rows:]], axis=1
     )
@@ -76,4 +76,4 @@ def _subspace(inputs: FloatArray, outputs: FloatArray, rows: int, period: float)
     roots = np.linalg.eigvals(shift) if order else np.empty(0)
     with np.errstate(divide="ignore"):
         poles = np.log(roots.astype(np.complex128)) / period
-    return HankelVote(values / limit, order, np.asarray(poles, np.complex128))
+    return OrderEstimate(values / limit, order, np.asarray(poles, np.complex128))

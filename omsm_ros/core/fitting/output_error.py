@@ -19,6 +19,7 @@ import numpy as np
 from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -42,22 +43,22 @@ class Problem:
     background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
-    starts_moving: fit also free decays, of what moved before the first sample
+    fits_initial_condition: fit also free decays, of what moved before the first sample
     """
 
-    motion: FloatArray
-    seen: FloatArray
+    input: FloatArray
+    output: FloatArray
     used: BoolArray
     period: float
     background: FloatArray
     rate: float
     noise: float = 0.0
-    starts_moving: bool = False
+    fits_initial_condition: bool = False
 
     @cached_property
     def closed_length(self) -> int:
         """Samples of one period."""
-        return len(close_period(self.motion, self.period))
+        return len(close_period(self.input, self.period))
 
     def closed_spectrum(self, values: FloatArray) -> ComplexArray:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
@@ -66,10 +67,10 @@ class Problem:
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
-        moved = motion_spectrum(self.motion, self.period, self.noise)
+        moved = motion_spectrum(self.input, self.period, self.noise)
         # A decay may be faster than anything in the motion: then the whole band is needed.
         missing = self.closed_length // 2 + 1 - len(moved)
-        return np.pad(moved, (0, missing)) if self.starts_moving else moved
+        return np.pad(moved, (0, missing)) if self.fits_initial_condition else moved
 
     @cached_property
     def s(self) -> ComplexArray:
@@ -80,7 +81,7 @@ class Problem:
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """What drives the system: spectra (k,), each with its number of numerator terms."""
         motion = (self._spectrum, structure.zeros + 1)
-        return [motion, (self._pulse, structure.poles)] if self.starts_moving else [motion]
+        return [motion, (self._pulse, structure.poles)] if self.fits_initial_condition else [motion]
 
     @cached_property
     def _pulse(self) -> ComplexArray:
@@ -93,16 +94,16 @@ class Problem:
         centre = -np.sqrt(2 * _PULSE_END) * width
         return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
 
-    def free_decays(self, fitted: Fit) -> FloatArray:
+    def initial_condition_response(self, fitted: Fit) -> FloatArray:
         """Free decays of the poles of ``fitted`` from before the first sample, (n, poles)."""
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
         spectra = powers * (lag * self._pulse)
-        return np.asarray(fft.irfft(spectra, self.closed_length)[:, : len(self.motion)].T)
+        return np.asarray(fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T)
 
     @cached_property
     def _target(self) -> FloatArray:
-        return self.seen[self.used]
+        return self.output[self.used]
 
     @cached_property
     def _fixed(self) -> FloatArray:
@@ -110,15 +111,15 @@ class Problem:
 
     def _in_time(self, spectrum: ComplexArray) -> FloatArray:
         back = fft.irfft(spectrum, self.closed_length, axis=-1)
-        return np.asarray(back[..., : len(self.motion)][..., self.used], np.float64)
+        return np.asarray(back[..., : len(self.input)][..., self.used], np.float64)
 
-    def project(self, scaled: Scaled, shape: FloatArray) -> Projection:
+    def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
         """Residual and its derivative by ψ after the linear parameters are eliminated."""
-        lag, relative = scaled.lag(shape, self.s)
+        lag, relative = scaled.lag(nonlinear, self.s)
         driven = self._driven(scaled.structure, lag)
         columns = np.column_stack([self._in_time(driven).T, self._fixed])
         basis, triangle = np.linalg.qr(columns)
-        linear = _solve(triangle, basis.T @ self._target)
+        linear = least_squares(triangle, basis.T @ self._target, _RANK_TOLERANCE)
         residual = self._target - columns @ linear
         moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
         jacobian = basis @ (basis.T @ moved) - moved
@@ -140,27 +141,27 @@ class Problem:
 
     def response(self, fitted: Fit) -> FloatArray:
         """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         terms = len(fitted.numerator)
         spectrum = fitted.numerator @ self._driven(fitted.structure, lag)[:terms]
-        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.motion)])
+        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
 
-    def output(self, fitted: Fit) -> FloatArray:
+    def modelled(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         spectrum = fitted.driven @ self._driven(fitted.structure, lag)
-        moved = fft.irfft(spectrum, self.closed_length)[: len(self.motion)]
+        moved = fft.irfft(spectrum, self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
         """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
-        lag, relative = fitted.scaled.lag(fitted.shape, self.s)
+        lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         by_numerator = fitted.gain * driven[1:terms]
-        by_shape = relative * (fitted.driven @ driven)
+        by_nonlinear = relative * (fitted.driven @ driven)
         by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
-        every = np.concatenate([by_numerator, by_shape, by_gain, driven[terms:]])
+        every = np.concatenate([by_numerator, by_nonlinear, by_gain, driven[terms:]])
         return np.column_stack([self._in_time(every).T, self._fixed])
 
     def bent(self, fitted: Fit) -> FloatArray:
@@ -168,21 +169,13 @@ class Problem:
 
         That is by coefficients of 1, s and s² in front of it: any response bends like that.
         """
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
         return np.column_stack(
             [self._in_time(np.concatenate([bends, driven[terms:]])).T, self._fixed]
         )
-
-
-def _solve(triangle: FloatArray, right: FloatArray) -> FloatArray:
-    """Least squares with a triangle that may be singular to rounding."""
-    scale = np.linalg.norm(triangle, axis=0)
-    scale[scale == 0] = 1.0
-    scaled = np.linalg.lstsq(triangle / scale, right, rcond=_RANK_TOLERANCE)[0]
-    return np.asarray(scaled / scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,12 +191,12 @@ class Projection:
 class Fit:
     """A fitted structure.
 
-    shape: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
+    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
     background: coefficients (q,);  residual: (k,) [m]
     """
 
     scaled: Scaled
-    shape: FloatArray
+    nonlinear: FloatArray
     driven: FloatArray
     background: FloatArray
     residual: FloatArray
@@ -246,7 +239,7 @@ class Fit:
     @property
     def dynamics(self) -> TransferFunction:
         """G(s) with G(0) = 1."""
-        return self.scaled.transfer_function(self.shape, self.numerator)
+        return self.scaled.transfer_function(self.nonlinear, self.numerator)
 
 
 class _Cache:
@@ -254,13 +247,13 @@ class _Cache:
 
     def __init__(self, problem: Problem, scaled: Scaled) -> None:
         self._problem, self._scaled = problem, scaled
-        self._shape: FloatArray | None = None
+        self._at: FloatArray | None = None
         self._value: Projection | None = None
 
-    def at(self, shape: FloatArray) -> Projection:
-        if self._value is None or self._shape is None or not np.array_equal(shape, self._shape):
-            self._value = self._problem.project(self._scaled, shape)
-            self._shape = shape.copy()
+    def at(self, nonlinear: FloatArray) -> Projection:
+        if self._value is None or self._at is None or not np.array_equal(nonlinear, self._at):
+            self._value = self._problem.project(self._scaled, nonlinear)
+            self._at = nonlinear.copy()
         return self._value
 
 
@@ -270,10 +263,10 @@ def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) ->
     cache = _Cache(problem, scaled)
     best, best_cost = starts[0], np.inf
     for start in starts:
-        shape = _descend(cache, scaled, start, _RACE_EVALUATIONS) if len(start) else start
-        cost = float(np.sum(cache.at(shape).residual ** 2))
+        nonlinear = _descend(cache, scaled, start, _RACE_EVALUATIONS) if len(start) else start
+        cost = float(np.sum(cache.at(nonlinear).residual ** 2))
         if cost < best_cost:
-            best, best_cost = shape, cost
+            best, best_cost = nonlinear, cost
     if len(best):
         best = _descend(cache, scaled, best, _FINISH_EVALUATIONS)
     at = cache.at(best)
@@ -288,34 +281,34 @@ def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int)
     out. A general solver factorises the whole jacobian at each step, and takes ten times as long.
     """
     lower, upper = scaled.bounds()
-    shape = np.clip(start, lower, upper)
-    at, damping, growth = cache.at(shape), _FIRST_DAMPING, 2.0
+    nonlinear = np.clip(start, lower, upper)
+    at, damping, growth = cache.at(nonlinear), _FIRST_DAMPING, 2.0
     cost = float(at.residual @ at.residual)
     for _ in range(evaluations):
         slope, curvature = at.jacobian.T @ at.residual, at.jacobian.T @ at.jacobian
         # A parameter at its bound that would leave the box stays.
-        free = ~(((shape <= lower) & (slope > 0)) | ((shape >= upper) & (slope < 0)))
+        free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
         scale = np.sqrt(np.diag(curvature))
         free &= scale > _INSENSITIVE * np.max(scale)
         if not np.any(free):
             break
         step = _damped_step(curvature, slope, scale, free, damping)
-        trial = np.clip(shape + step, lower, upper)
+        trial = np.clip(nonlinear + step, lower, upper)
         tried = cache.at(trial)
         new_cost = float(tried.residual @ tried.residual)
         if not new_cost < cost:
-            if np.all(np.abs(trial - shape) <= _SMALLEST_STEP * (1 + np.abs(shape))):
+            if np.all(np.abs(trial - nonlinear) <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
                 break
             damping, growth = damping * growth, growth * 2
             continue
         gained, promised = cost - new_cost, -float(step @ (2 * slope + curvature @ step))
-        shape, at, cost = trial, tried, new_cost
+        nonlinear, at, cost = trial, tried, new_cost
         ratio = gained / promised if promised > 0 else 1.0
         damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
         # χ² that changes by less than this is converged.
         if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
             break
-    return shape
+    return nonlinear
 
 
 def _damped_step(

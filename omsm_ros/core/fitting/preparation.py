@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
+from omsm_ros.core.fitting.least_squares import least_squares, unexplained
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.steps import (
@@ -99,11 +100,11 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
             "lost, while something settles, and where the motion starts or ends; record at least "
             f"{LEAST_SAMPLES} more"
         )
-    seen = np.where(record.ok, record.distance, 0.0)
+    output = np.where(record.ok, record.distance, 0.0)
     ramp = np.linspace(-1.0, 1.0, samples)
     return Problem(
-        motion=carried - np.mean(motion),
-        seen=seen - np.mean(seen[used]),
+        input=carried - np.mean(motion),
+        output=output - np.mean(output[used]),
         used=used,
         period=record.sample_period,
         background=np.column_stack([np.ones(samples), ramp]),
@@ -159,8 +160,8 @@ def content_frequency(motion: FloatArray, sample_period: float) -> float:
 
 
 def _static_gain(problem: Problem) -> float:
-    columns = np.column_stack([problem.motion, problem.background])[problem.used]
-    return float(np.linalg.lstsq(columns, problem.seen[problem.used], rcond=None)[0][0])
+    columns = np.column_stack([problem.input, problem.background])[problem.used]
+    return float(least_squares(columns, problem.output[problem.used])[0])
 
 
 def check_gain(gain: float) -> None:
@@ -175,7 +176,7 @@ def check_gain(gain: float) -> None:
 
 
 def _check_not_clipped(problem: Problem) -> None:
-    motion, seen = problem.motion[problem.used], problem.seen[problem.used]
+    motion, seen = problem.input[problem.used], problem.output[problem.used]
     levels = np.unique(seen)
     quantum = float(np.min(np.diff(levels)))
     allowed = max(20 * sample_noise(seen), 3 * quantum, 2e-3 * float(np.ptp(motion)))
@@ -191,7 +192,7 @@ def _check_not_clipped(problem: Problem) -> None:
 
 def _without_spikes(problem: Problem) -> tuple[Problem, int]:
     """Take out single readings that stand apart from both neighbours, and count them."""
-    apart = np.where(problem.used, problem.seen - _static_gain(problem) * problem.motion, np.nan)
+    apart = np.where(problem.used, problem.output - _static_gain(problem) * problem.input, np.nan)
     before, after = np.roll(apart, 1), np.roll(apart, -1)
     jump = np.abs(apart - 0.5 * (before + after))
     # What the edges do nearby is no spike, however large.
@@ -209,15 +210,11 @@ def _with_background(problem: Problem, steps: Steps) -> tuple[Problem, int | Non
     background, backlash_column = problem.background, None
     play = backlash_columns(steps, len(ramp))
     for columns, is_backlash in ((np.column_stack([ramp**2, ramp**3]), False), (play, True)):
-        known = np.column_stack([background, problem.motion])[problem.used]
-        left = _unexplained(residual, known)
-        after = _unexplained(residual, np.column_stack([known, columns[problem.used]]))
+        known = np.column_stack([background, problem.input])[problem.used]
+        left = unexplained(known, residual)
+        after = unexplained(np.column_stack([known, columns[problem.used]]), residual)
         improved = (float(left @ left) - float(after @ after)) / np.mean(after**2)
         if columns.shape[1] and improved > _CLEARLY_SHOWN * columns.shape[1]:
             backlash_column = background.shape[1] if is_backlash else backlash_column
             background = np.column_stack([background, columns])
     return replace(problem, background=background), backlash_column
-
-
-def _unexplained(values: FloatArray, columns: FloatArray) -> FloatArray:
-    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])

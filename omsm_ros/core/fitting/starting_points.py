@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roots
+from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -31,26 +32,26 @@ _ADDED_POLE = -10.0
 
 @dataclass(frozen=True, eq=False)
 class StartingPoints:
-    """Proposes shapes ψ for the structures of one problem.
+    """Propose nonlinear parameters ψ for the structures of one problem.
 
-    pure_delay: the fit of a delay alone;  vote: of the singular values
+    pure_delay: the fit of a delay alone;  estimate: of the order
     """
 
     problem: Problem
     pure_delay: Fit
-    vote: HankelVote
+    vote: OrderEstimate
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
-        """Shapes of ``structure``, given the fits made so far."""
+        """Return ψ of ``structure``, given the fits made so far."""
         scaled = Scaled(structure, self.problem.rate)
-        delay = float(self.pure_delay.shape[-1]) if self.pure_delay.structure.delay else 0.0
+        delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
         if structure.poles == 0:
-            return [self.pure_delay.shape]
+            return [self.pure_delay.nonlinear]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
-        found = [_guess(scaled, kept), scaled.shape_of(self._linear(structure, kept), kept)]
+        found = [_guess(scaled, kept), scaled.nonlinear_of(self._linear(structure, kept), kept)]
         subspace = _stable(self.vote.poles / self.problem.rate)
         if len(subspace) == structure.poles:
-            found.append(scaled.shape_of(subspace, kept))
+            found.append(scaled.nonlinear_of(subspace, kept))
         contained = [f for f in smaller if structure.contains(f.structure)]
         if contained:
             found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
@@ -60,8 +61,8 @@ class StartingPoints:
     def _probe(self) -> ComplexArray:
         """Spectrum of what was seen, without background, lost samples taken from the motion."""
         problem, lag = self.problem, self.pure_delay
-        seen = problem.seen - problem.background @ lag.background
-        filled = np.where(problem.used, seen, lag.gain * problem.motion)
+        seen = problem.output - problem.background @ lag.background
+        filled = np.where(problem.used, seen, lag.gain * problem.input)
         return problem.closed_spectrum(np.asarray(filled))
 
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:
@@ -80,10 +81,8 @@ class StartingPoints:
             weight = 1 / np.abs(np.prod(1 - s / poles, axis=1))
             columns = every * weight[:, np.newaxis]
             columns = np.concatenate([columns.real, columns.imag])
-            scale = np.linalg.norm(columns, axis=0)
-            scale[scale == 0] = 1.0
             target = np.concatenate([(probe * weight).real, (probe * weight).imag])
-            solved = np.linalg.lstsq(columns / scale, target, rcond=None)[0] / scale
+            solved = least_squares(columns, target)
             denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
             found = _stable(ascending_roots(denominator))
             if len(found) != structure.poles:
@@ -99,7 +98,7 @@ def _guess(scaled: Scaled, delay: float) -> FloatArray:
         poles += [upper, upper.conjugate()]
     if scaled.structure.poles % 2:
         poles.append(complex(-2.0 * _GUESSED_RATE))
-    return scaled.shape_of(np.array(poles, np.complex128), delay)
+    return scaled.nonlinear_of(np.array(poles, np.complex128), delay)
 
 
 def _stable(poles: ComplexArray) -> ComplexArray:
@@ -116,5 +115,5 @@ def _grown(scaled: Scaled, fit: Fit, delay: float) -> FloatArray:
     """The smaller fit with fast poles added; their zeros follow linearly."""
     added = _ADDED_POLE * 1.5 ** np.arange(scaled.structure.poles - fit.structure.poles)
     own = _stable(fit.dynamics.poles() / scaled.rate)
-    tail = float(fit.shape[-1]) if fit.structure.delay else 0.02 * delay
-    return scaled.shape_of(np.concatenate([own, added.astype(np.complex128)]), tail)
+    tail = float(fit.nonlinear[-1]) if fit.structure.delay else 0.02 * delay
+    return scaled.nonlinear_of(np.concatenate([own, added.astype(np.complex128)]), tail)

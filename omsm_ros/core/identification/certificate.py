@@ -144,6 +144,6 @@ def _agreement(problem: Problem, best: Fit, up_to: float) -> float | None:
     segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
     segment = max(segment, 16)
     value = response_agreement(
-        frequency_response(problem.motion, residual, problem.period, segment), up_to
+        frequency_response(problem.input, residual, problem.period, segment), up_to
     )
     return value if np.isfinite(value) else None

@@ -36,7 +36,7 @@ def hidden_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> Covar
     from_noise: (p, p) covariance of the coefficients from the noise of probe and encoder
     """
     problem = prepared.problem
-    bound = inter_sample_delay_bound(problem.motion, prepared.steps, problem.period)
+    bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
     delay_noise = low_frequency_delay_uncertainty(fit.dynamics, from_noise)
     return CovarianceTerm(
         hidden_motion_covariance(fit.dynamics, bound, problem.period),

@@ -53,7 +53,7 @@ def fitted_record(identified: Identification) -> FittedRecord:
     residual = problem.on_grid(fit.residual, np.nan)
     return FittedRecord(
         sample_period=problem.period,
-        input=problem.motion,
+        input=problem.input,
         output=np.asarray(modelled + residual / fit.gain, np.float64),
         modelled=modelled,
         residual=residual,
@@ -69,7 +69,7 @@ def _measured(
     if not _LEAST_SEGMENT <= segment <= len(missed) // 2:
         return None
     output = modelled + np.where(np.isfinite(missed), missed, 0.0)
-    return frequency_response(problem.motion, output, problem.period, segment)
+    return frequency_response(problem.input, output, problem.period, segment)
 
 
 def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:

@@ -18,7 +18,7 @@ from scipy import fft, signal
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.fitting.starting_points import StartingPoints
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -29,7 +29,7 @@ _GREATEST_ORDER = 8
 _PARTS = 6
 # Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
 _FAST = float(np.log(0.1))
-_NO_VOTE = HankelVote(np.empty(0), 0, np.empty(0, np.complex128))
+_NO_VOTE = OrderEstimate(np.empty(0), 0, np.empty(0, np.complex128))
 
 
 class HeldProblem(Problem):
@@ -38,7 +38,7 @@ class HeldProblem(Problem):
     @cached_property
     def closed_length(self) -> int:
         """Samples of the record: a held input needs no bridge back to its start."""
-        return len(self.motion)
+        return len(self.input)
 
     def closed_spectrum(self, values: FloatArray) -> ComplexArray:
         """Transform of ``values`` (n,) as they are, shape (k,)."""
@@ -46,7 +46,7 @@ class HeldProblem(Problem):
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
-        return self.closed_spectrum(self.motion)
+        return self.closed_spectrum(self.input)
 
     @cached_property
     def s(self) -> ComplexArray:
@@ -70,13 +70,13 @@ class HeldProblem(Problem):
 
     def with_initial_state(self, fitted: Fit) -> FloatArray:
         """Output (n,) of a fit's dynamics, with initial state and offset fitted here."""
-        lag, _ = fitted.scaled.lag(fitted.shape, self.s)
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         spectra = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
-        columns = fft.irfft(spectra, self.closed_length)[:, : len(self.motion)].T
+        columns = fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T
         moved = columns[:, :terms] @ fitted.driven[:terms]
         free = np.column_stack([columns[:, terms:], self.background])
-        rest = (self.seen - moved)[self.used]
+        rest = (self.output - moved)[self.used]
         scale = np.linalg.norm(free[self.used], axis=0)
         scale[scale == 0] = 1.0
         state = np.linalg.lstsq(free[self.used] / scale, rest, rcond=None)[0]
@@ -177,8 +177,8 @@ def _by_order(problem: HeldProblem, order: int) -> list[Fit]:
     points = StartingPoints(problem, fits[0], _NO_VOTE)
     for poles in range(1, order + 1):
         structure = Structure(poles, poles, False)
-        shapes = [f.shape for f in fits]
-        starts = points.of(structure, fits[1:]) + _grown(shapes, len(problem.seen))
+        shapes = [f.nonlinear for f in fits]
+        starts = points.of(structure, fits[1:]) + _grown(shapes, len(problem.output))
         fits.append(fit(problem, structure, starts))
     return fits
 
@@ -197,7 +197,7 @@ def _blind_runs(
 ) -> list[HeldFit]:
     """The same without the samples ``hidden``, each from where ``fits`` found its minimum."""
     rest = replace(problem, used=problem.used & ~hidden)
-    return _free_runs(rest, delay, [fit(rest, f.structure, [f.shape]) for f in fits])
+    return _free_runs(rest, delay, [fit(rest, f.structure, [f.nonlinear]) for f in fits])
 
 
 def _grown(shapes: Sequence[FloatArray], samples: int) -> list[FloatArray]:
@@ -226,8 +226,8 @@ def _delayed(
 ) -> HeldProblem:
     late = np.roll(command, delay)
     return HeldProblem(
-        motion=late - np.mean(late),
-        seen=seen,
+        input=late - np.mean(late),
+        output=seen,
         used=used & (np.arange(len(used)) >= delay),
         period=period,
         background=np.ones((len(seen), 1)),
@@ -247,9 +247,9 @@ def _efficient(problem: HeldProblem, fitted: Fit) -> FloatArray:
         lost = np.convolve(~problem.used, np.ones(len(whitener)))[: len(problem.used)] > 0.5
         white = replace(
             problem,
-            motion=signal.lfilter(whitener, 1.0, problem.motion),
-            seen=signal.lfilter(whitener, 1.0, problem.seen),
+            input=signal.lfilter(whitener, 1.0, problem.input),
+            output=signal.lfilter(whitener, 1.0, problem.output),
             used=problem.used & apart & ~lost,
         )
-        fitted = fit(white, fitted.structure, [fitted.shape])
+        fitted = fit(white, fitted.structure, [fitted.nonlinear])
     return problem.with_initial_state(fitted)

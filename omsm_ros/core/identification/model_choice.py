@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.fitting.initial_condition import still_decays
+from omsm_ros.core.fitting.initial_condition import starts_ringing
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.order_choice import Candidate, choose, explore, held_out_rms
-from omsm_ros.core.fitting.order_estimate import HankelVote, hankel_vote
+from omsm_ros.core.fitting.order_estimate import OrderEstimate, estimate_order
 from omsm_ros.core.fitting.output_error import Fit, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.fitting.starting_points import StartingPoints
@@ -24,16 +24,16 @@ class Model:
 
     chosen: Candidate
     candidates: Sequence[Candidate]
-    vote: HankelVote
+    vote: OrderEstimate
 
 
 def choose_model(prepared: Prepared, order: int = 0) -> Model:
     """Fit structures to the prepared problem and choose among them; ``order`` poles, or 0."""
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    static = lag.gain * problem.motion + problem.background @ lag.background
-    deviation = (problem.seen - static) / lag.gain
-    vote = hankel_vote(problem.motion, deviation, problem.used, problem.period)
+    static = lag.gain * problem.input + problem.background @ lag.background
+    deviation = (problem.output - static) / lag.gain
+    vote = estimate_order(problem.input, deviation, problem.used, problem.period)
     points = StartingPoints(problem, lag, vote)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
@@ -41,7 +41,7 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
 
     colour = noise_colour(problem, lag, prepared.steps)
     candidates = explore(fit_structure, vote.order, order, colour)
-    held = held_out(prepared.steps, len(problem.motion))
+    held = held_out(prepared.steps, len(problem.input))
     chosen, candidates = choose(candidates, lambda f: held_out_rms(problem, f, held))
     return Model(chosen, candidates, vote)
 
@@ -54,7 +54,7 @@ def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, Mode
     model = choose_model(prepared, order)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
     at_rest = not prepared.steps.moving[0]
-    if not still_decays(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
+    if not starts_ringing(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
         return prepared, model
-    prepared = replace(prepared, problem=replace(prepared.problem, starts_moving=True))
+    prepared = replace(prepared, problem=replace(prepared.problem, fits_initial_condition=True))
     return prepared, choose_model(prepared, order)

@@ -14,6 +14,7 @@ from scipy import fft, stats
 
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.fitting.covariance import autoregression
+from omsm_ros.core.fitting.least_squares import orthonormal
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -55,13 +56,13 @@ def residual_tests(
         chi_square,
         noise,
         whiteness(fitted.residual),
-        independence(fitted.residual, np.gradient(problem.motion)[problem.used]),
+        independence(fitted.residual, np.gradient(problem.input)[problem.used]),
     )
 
 
 def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
     """Power of the noise at low frequency over its mean where the axis rests; 1 for white."""
-    on_grid = problem.seen - problem.output(fitted)
+    on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
     if len(rest) < _LEAST_REST_SAMPLES:
         return 1.0
@@ -98,8 +99,7 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     so few of its directions count, and only those above rounding are counted.
     """
     past = np.column_stack([np.roll(drive, lag) for lag in range(lags)])[lags:]
-    left, values, _ = np.linalg.svd(past, full_matrices=False)
-    basis = left[:, values > 1e-6 * values[0]] if values[0] > 0 else left[:, :0]
+    basis = orthonormal(past, 1e-6) if np.any(past) else past[:, :0]
     rest = residual[lags:]
     statistic = float(np.sum((basis.T @ rest) ** 2)) / float(np.mean(rest**2) or 1.0)
     return float(stats.chi2.sf(statistic, basis.shape[1])) if basis.shape[1] else 1.0

@@ -58,7 +58,7 @@ def response_uncertainty(
     size, dynamics = best.structure.size, best.dynamics
     passed = replace(dynamics, numerator=best.gain * dynamics.numerator)
     every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
-    transform = best.scaled.coefficient_jacobian(best.shape)
+    transform = best.scaled.coefficient_jacobian(best.nonlinear)
     from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
     terms = [term(prepared, best, from_noise) for term in COVARIANCE_TERMS]
     covariance = _symmetric(from_noise + np.sum([t.covariance for t in terms], axis=0))
@@ -119,7 +119,7 @@ def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
     taper = np.zeros(length)
     # From one end of what is compared to the other, so that no end breaks off.
     taper[compared[0] : compared[-1] + 1] = signal.windows.hann(compared[-1] + 1 - compared[0])
-    answer = problem.output(best) - problem.background @ best.background
+    answer = problem.modelled(best) - problem.background @ best.background
     seen = best.samples / (compared[-1] + 1 - compared[0])
     noise = noise_spectrum(best.residual, length) * float(taper @ taper) / seen
     return shown_up_to(

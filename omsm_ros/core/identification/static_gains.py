@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.fitting.least_squares import unit_columns
 from omsm_ros.core.fitting.steps import Edge, find_steps
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
@@ -86,10 +87,10 @@ def _ratio(travel: FloatArray, seen: FloatArray, time: FloatArray) -> Gain:
         )
     x, t, y = travel[known], time[known], seen[known]
     columns = np.column_stack([x - x.mean(), t / t[-1], np.ones(len(x))])
-    scale = np.linalg.norm(columns, axis=0)
-    inverse = np.linalg.pinv(columns / scale)
+    unit, scale = unit_columns(columns)
+    inverse = np.linalg.pinv(unit)
     solved = inverse @ y
-    left = y - columns / scale @ solved
-    variance = float(left @ left) / max(len(y) - 3, 1)
+    residual = y - unit @ solved
+    variance = float(residual @ residual) / max(len(y) - 3, 1)
     uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
     return Gain(float(abs(solved[0]) / scale[0]), float(uncertainty))

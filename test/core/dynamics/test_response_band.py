@@ -63,7 +63,7 @@ def test_noise_of_the_motion_counts_where_a_resonance_lifts_it():
     ringing = np.exp(-0.02 * omega * (time % 1.0)) * np.array([np.cos(omega * time), time % 1.0])
     ringing[1] *= np.sin(omega * time)
     columns, motion = ringing.T, 1e3 * np.sign(np.sin(2 * np.pi * time))
-    problem = replace(problem_for(samples), motion=motion, noise=0.06)
+    problem = replace(problem_for(samples), input=motion, noise=0.06)
     through = resonance.response(np.fft.rfftfreq(samples, period))
     fits, stated, without = [], [], []
     for _ in range(200):

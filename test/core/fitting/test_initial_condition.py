@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.initial_condition import still_decays
+from omsm_ros.core.fitting.initial_condition import starts_ringing
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Problem, fit
 
@@ -40,13 +40,13 @@ def problem(amplitude, seed=1):
 
 
 def fitted(of):
-    start = Scaled(MODE, RATE).shape_of(TRUTH.poles() / RATE, 0.0)
+    start = Scaled(MODE, RATE).nonlinear_of(TRUTH.poles() / RATE, 0.0)
     return fit(of, MODE, [start])
 
 
 def test_free_decays_are_those_of_the_differential_equation():
-    whole = replace(problem(0.0), starts_moving=True)
-    columns = whole.free_decays(fitted(problem(0.0)))[SKIPPED:]
+    whole = replace(problem(0.0), fits_initial_condition=True)
+    columns = whole.initial_condition_response(fitted(problem(0.0)))[SKIPPED:]
     expected = ringing(1.0)[SKIPPED:]
     columns = columns / np.linalg.norm(columns, axis=0)
     left = expected - columns @ np.linalg.lstsq(columns, expected, rcond=None)[0]
@@ -57,22 +57,22 @@ def test_free_decays_are_those_of_the_differential_equation():
 @pytest.mark.parametrize("amplitude", [0.0, 100e-9, 3e-6])
 def test_ringing_is_seen_where_it_is(amplitude):
     of = problem(amplitude)
-    assert still_decays(of, fitted(of)) is (amplitude > 0)
+    assert starts_ringing(of, fitted(of)) is (amplitude > 0)
 
 
 def test_a_record_that_starts_moving_is_not_asked():
     """What moved before is unknown; a little of it would bias long before it showed."""
     of = problem(0.0)
-    assert still_decays(of, fitted(of), at_rest=False)
+    assert starts_ringing(of, fitted(of), at_rest=False)
 
 
 def test_a_chance_is_rarely_taken_for_ringing():
-    assert not any(still_decays(of, fitted(of)) for of in (problem(0.0, s) for s in range(40)))
+    assert not any(starts_ringing(of, fitted(of)) for of in (problem(0.0, s) for s in range(40)))
 
 
 def test_with_free_decays_only_noise_is_left():
     of = problem(3e-6)
-    without, found = fitted(of), fitted(replace(of, starts_moving=True))
+    without, found = fitted(of), fitted(replace(of, fits_initial_condition=True))
     (mode,) = found.dynamics.modes()
     assert mode.damping == pytest.approx(DAMPING, rel=1e-3)
     assert found.gain == pytest.approx(1.0, abs=1e-4)
@@ -83,18 +83,20 @@ def test_with_free_decays_only_noise_is_left():
 def test_decays_count_as_parameters():
     of = problem(0.0)
     assert fitted(of).size == MODE.size
-    assert fitted(replace(of, starts_moving=True)).size == MODE.size + MODE.poles
+    assert fitted(replace(of, fits_initial_condition=True)).size == MODE.size + MODE.poles
 
 
 def test_sensitivity_includes_the_decays():
     """Against differences of the output, at fixed linear parameters."""
-    of = replace(problem(3e-6), starts_moving=True)
+    of = replace(problem(3e-6), fits_initial_condition=True)
     found = fitted(of)
     columns = of.sensitivity(found)
     for k in range(MODE.poles):
         step = np.zeros(MODE.poles)
         step[k] = 1e-6
-        up, down = (of.output(replace(found, shape=found.shape + sign * step)) for sign in (1, -1))
+        up, down = (
+            of.modelled(replace(found, nonlinear=found.nonlinear + sign * step)) for sign in (1, -1)
+        )
         difference = ((up - down) / 2e-6)[of.used]
         np.testing.assert_allclose(columns[:, k], difference, atol=1e-5 * np.max(difference))
     assert columns.shape[1] == MODE.size + 1 + MODE.poles + 1
@@ -104,6 +106,8 @@ def test_fast_poles_are_over_before_the_first_sample_that_counts():
     """Then nothing is looked for, whatever the residual holds."""
     fast = Structure(1, 0, False)
     of = problem(3e-6)
-    found = fit(of, fast, [Scaled(fast, RATE).shape_of(np.array([-4000 / RATE + 0j]), 0.0)])
-    quick = replace(found, shape=Scaled(fast, RATE).shape_of(np.array([-4000 / RATE + 0j]), 0.0))
-    assert not still_decays(of, quick)
+    found = fit(of, fast, [Scaled(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0)])
+    quick = replace(
+        found, nonlinear=Scaled(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0)
+    )
+    assert not starts_ringing(of, quick)

@@ -11,7 +11,7 @@ EVERY = [Structure(n, m, d) for n in range(1, 6) for m in range(n) for d in (Fal
 
 
 def random_shape(scaled, seed):
-    shape = np.random.default_rng(seed).normal(0, 1, scaled.shape_size)
+    shape = np.random.default_rng(seed).normal(0, 1, scaled.nonlinear_size)
     if scaled.structure.delay:
         shape[-1] = abs(shape[-1])
     return shape
@@ -72,10 +72,10 @@ def test_the_jacobian_of_the_coefficients_is_that_of_finite_differences(structur
         np.testing.assert_allclose(jacobian[:, k] / scale, difference / scale, atol=1e-4)
 
 
-def test_a_shape_of_poles_has_those_poles():
+def test_a_nonlinear_of_poles_has_those_poles():
     poles = np.array([-1 + 3j, -1 - 3j, -0.5, -4.0, -9.0], complex)
     scaled = Scaled(Structure(5, 0, True), 200.0)
-    g = scaled.transfer_function(scaled.shape_of(poles, 0.25), np.ones(1))
+    g = scaled.transfer_function(scaled.nonlinear_of(poles, 0.25), np.ones(1))
     np.testing.assert_allclose(
         np.sort_complex(g.poles() / 200.0), np.sort_complex(poles), rtol=1e-6
     )

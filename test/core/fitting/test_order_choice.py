@@ -18,7 +18,7 @@ from omsm_ros.core.fitting.order_choice import (
     information,
     structures,
 )
-from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.starting_points import StartingPoints
 from omsm_ros.core.machine.trajectories import StepTest
@@ -45,7 +45,7 @@ def problem_of(dynamics, seed=1):
 def fitter(problem):
     """How one structure is fitted to ``problem``, given the smaller ones."""
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    points = StartingPoints(problem, lag, HankelVote(np.empty(0), 0, np.empty(0, complex)))
+    points = StartingPoints(problem, lag, OrderEstimate(np.empty(0), 0, np.empty(0, complex)))
     return lambda structure, smaller: fit(problem, structure, points.of(structure, smaller))
 
 
@@ -117,7 +117,7 @@ def test_held_out_edges_veto_what_does_worse_on_them():
 
 def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only():
     problem = problem_of(PAIR)
-    held = np.arange(len(problem.seen)) > 0.6 * len(problem.seen)
+    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
     by_poles = {c.fit.structure.poles: c.fit for c in explored(PAIR)}
     assert held_out_rms(problem, by_poles[2], held) == pytest.approx(NOISE, rel=0.1)
     assert held_out_rms(problem, by_poles[0], held) > 10 * NOISE
@@ -128,8 +128,8 @@ def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only()
 def test_what_was_held_out_did_not_teach_the_model():
     """Of other values where it is held out, the same structure misses just those."""
     problem = problem_of(PAIR)
-    held = np.arange(len(problem.seen)) > 0.6 * len(problem.seen)
-    shifted = replace(problem, seen=problem.seen + np.where(held, 1e-6, 0.0))
+    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
+    shifted = replace(problem, seen=problem.output + np.where(held, 1e-6, 0.0))
     found = best(explored(PAIR)).fit
     assert held_out_rms(shifted, found, held) == pytest.approx(1e-6, rel=0.01)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.fitting.order_estimate import hankel_vote
+from omsm_ros.core.fitting.order_estimate import estimate_order
 
 PERIOD = 1e-3
 
@@ -29,7 +29,7 @@ def simulated(poles, noise, seed=1, samples=4000):
 )
 def test_the_order_and_the_poles_of_a_clear_system_are_found(poles):
     motion, deviation = simulated(poles, 1e-11)
-    vote = hankel_vote(motion, deviation, np.ones(len(motion), bool), PERIOD)
+    vote = estimate_order(motion, deviation, np.ones(len(motion), bool), PERIOD)
     assert vote.order == len(poles)
     expected = np.log(np.asarray(poles, complex)) / PERIOD
     np.testing.assert_allclose(np.sort_complex(vote.poles), np.sort_complex(expected), rtol=0.02)
@@ -39,13 +39,13 @@ def test_the_order_and_the_poles_of_a_clear_system_are_found(poles):
 def test_noise_alone_has_no_states(seed):
     motion, _ = simulated([0.6], 0.0, seed)
     noise = np.random.default_rng(seed + 100).normal(0, 1e-8, len(motion))
-    vote = hankel_vote(motion, noise, np.ones(len(motion), bool), PERIOD)
+    vote = estimate_order(motion, noise, np.ones(len(motion), bool), PERIOD)
     assert vote.order == 0
     assert 0.4 < vote.singular_values[0] < 1.0
 
 
 def test_too_few_samples_give_an_empty_vote():
-    vote = hankel_vote(np.arange(20.0), np.arange(20.0), np.ones(20, bool), PERIOD)
+    vote = estimate_order(np.arange(20.0), np.arange(20.0), np.ones(20, bool), PERIOD)
     assert vote.order == 0
     assert len(vote.singular_values) == 0
 
@@ -55,4 +55,4 @@ def test_lost_samples_are_left_out():
     used = np.ones(len(motion), bool)
     used[::100] = False
     spoiled = np.where(used, deviation, 1.0)
-    assert hankel_vote(motion, spoiled, used, PERIOD).order == 1
+    assert estimate_order(motion, spoiled, used, PERIOD).order == 1

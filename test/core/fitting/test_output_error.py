@@ -46,7 +46,7 @@ def resonance(frequency, damping):
 
 
 def start(structure, poles, delay=0.1):
-    return Scaled(structure, RATE).shape_of(np.asarray(poles, complex), delay)
+    return Scaled(structure, RATE).nonlinear_of(np.asarray(poles, complex), delay)
 
 
 def test_a_resonance_is_found_exactly_without_noise():
@@ -76,7 +76,7 @@ def test_a_lost_sample_is_not_compared():
     truth = resonance(40.0, 0.3)
     problem = problem_of(truth)
     lost = np.random.default_rng(2).random(len(problem.used)) < 0.3
-    spoiled = replace(problem, seen=np.where(lost, 1.0, problem.seen), used=~lost)
+    spoiled = replace(problem, output=np.where(lost, 1.0, problem.output), used=~lost)
     structure = Structure(2, 0, False)
     found = fit(spoiled, structure, [start(structure, [-1 + 1j, -1 - 1j])])
     assert found.samples == np.sum(~lost)
@@ -113,8 +113,8 @@ def test_sensitivity_is_the_derivative_of_the_output():
     problem = problem_of(resonance(60.0, 0.2), gain=-0.98, noise=1e-8)
     found = fit(problem, structure, [start(structure, [-1 + 1.5j, -1 - 1.5j])])
     columns = problem.sensitivity(found)
-    moved = replace(found, shape=found.shape + np.array([1e-6, 0, 0]))
-    difference = (problem.output(moved) - problem.output(found)) / 1e-6
+    moved = replace(found, nonlinear=found.nonlinear + np.array([1e-6, 0, 0]))
+    difference = (problem.modelled(moved) - problem.modelled(found)) / 1e-6
     np.testing.assert_allclose(columns[:, 1], difference, atol=1e-3 * np.ptp(difference))
 
 
@@ -124,10 +124,10 @@ def test_a_response_bends_by_gain_lag_and_curvature():
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
     found = fit(problem, structure, [start(structure, [-1 + 1.5j, -1 - 1.5j])])
     columns = problem.bent(found)
-    closed = close_period(problem.motion, PERIOD)
+    closed = close_period(problem.input, PERIOD)
     frequency = np.fft.rfftfreq(len(closed), PERIOD)
     moved = np.fft.rfft(closed) * found.dynamics.response(frequency)
     for power in range(3):
         bent = moved * (2j * np.pi * frequency / RATE) ** power
-        expected = np.fft.irfft(bent, len(closed))[: len(problem.motion)]
+        expected = np.fft.irfft(bent, len(closed))[: len(problem.input)]
         np.testing.assert_allclose(columns[:, power], expected, atol=1e-9 * np.ptp(expected))

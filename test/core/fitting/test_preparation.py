@@ -94,13 +94,13 @@ def test_a_motion_that_breaks_off_ends_at_rest_and_without_new_content():
         lines = np.fft.rfftfreq(len(closed), period) > frequency + 10.0
         return np.max(spectrum[lines]) / np.max(spectrum)
 
-    assert beyond(problem.motion) < 1e-5
+    assert beyond(problem.input) < 1e-5
     assert beyond(z) > 1e-4
 
 
 def test_what_rests_at_both_ends_is_left_as_it_is():
     recorded = record_of()
     problem = prepare(recorded, "encoder").problem
-    np.testing.assert_allclose(np.diff(problem.motion), np.diff(recorded.z), atol=1e-18)
+    np.testing.assert_allclose(np.diff(problem.input), np.diff(recorded.z), atol=1e-18)
     assert problem.used[60]
     assert problem.used[-10]

@@ -5,12 +5,12 @@ import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_estimate import HankelVote
+from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.starting_points import StartingPoints
 
 PERIOD = 1e-3
-NO_VOTE = HankelVote(np.empty(0), 0, np.empty(0, complex))
+NO_VOTE = OrderEstimate(np.empty(0), 0, np.empty(0, complex))
 
 
 def points_for(dynamics, vote=NO_VOTE):
@@ -45,7 +45,7 @@ def test_linear_least_squares_finds_a_resonance_no_guess_would(frequency, dampin
 
 def test_the_poles_of_the_subspace_method_are_one_start():
     poles = np.array([-20 + 400j, -20 - 400j])
-    points = points_for(resonance(50.0, 0.3), HankelVote(np.array([2.0, 1.5]), 2, poles))
+    points = points_for(resonance(50.0, 0.3), OrderEstimate(np.array([2.0, 1.5]), 2, poles))
     structure = Structure(2, 0, False)
     found = frequencies_of(points, structure, points.of(structure, []))
     assert any(f == pytest.approx(abs(poles[0]) / (2 * np.pi)) for f in found)
@@ -61,10 +61,10 @@ def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():
     assert costs[1] >= costs[2] * 0.999
 
 
-def test_every_start_has_the_shape_of_its_structure_and_is_stable():
+def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
     points = points_for(resonance(60.0, 0.1))
     for structure in (Structure(4, 3, True), Structure(3, 2, False), Structure(0, 0, True)):
         scaled = Scaled(structure, points.problem.rate)
         for shape in points.of(structure, []):
-            assert len(shape) == scaled.shape_size
+            assert len(shape) == scaled.nonlinear_size
             assert scaled.transfer_function(shape, np.ones(1)).is_stable

@@ -71,8 +71,8 @@ class TestRecordThatStartsRinging:
 
     def test_it_is_not_still_at_the_start(self, ringing):
         """Without the initial-condition response the same model misses ten times the noise."""
-        without = replace(ringing.prepared.problem, starts_moving=False)
-        fit_without = fit(without, ringing.fit.structure, [ringing.fit.shape])
+        without = replace(ringing.prepared.problem, fits_initial_condition=False)
+        fit_without = fit(without, ringing.fit.structure, [ringing.fit.nonlinear])
         assert fit_without.rms > 50e-9
 
     def test_the_page_draws_the_residual_that_is_certified(self, ringing):
@@ -124,9 +124,9 @@ def later(identified, delay):
     found, problem = identified.fit, identified.prepared.problem
     assert not found.structure.delay
     scaled = Scaled(replace(found.structure, delay=True), problem.rate)
-    shape = np.append(found.shape, delay * problem.rate)
-    moved = replace(found, scaled=scaled, shape=shape)
-    return replace(moved, residual=(problem.seen - problem.output(moved))[problem.used])
+    nonlinear = np.append(found.nonlinear, delay * problem.rate)
+    moved = replace(found, scaled=scaled, nonlinear=nonlinear)
+    return replace(moved, residual=(problem.output - problem.modelled(moved))[problem.used])
 
 
 def test_a_motion_without_edges_has_no_mean_edge(fitted):

@@ -1,0 +1,45 @@
+"""Least squares with columns of any units, against the normal equations and by geometry."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.fitting.least_squares import (
+    least_squares,
+    orthonormal,
+    unexplained,
+    unit_columns,
+)
+
+RANDOM = np.random.default_rng(1)
+COLUMNS = RANDOM.normal(size=(50, 3)) * [1e-9, 1.0, 1e12]
+
+
+def test_columns_of_any_units_are_solved_exactly():
+    """Unscaled, the column of nanometres would be taken for rounding beside that of 1e12."""
+    truth = np.array([3e9, -2.0, 5e-12])
+    assert least_squares(COLUMNS, COLUMNS @ truth) == pytest.approx(truth, rel=1e-9)
+    plain = np.linalg.lstsq(COLUMNS, COLUMNS @ truth, rcond=None)[0]
+    assert abs(plain[0] - truth[0]) > 1e9
+
+
+def test_the_residual_is_orthogonal_to_every_column():
+    values = RANDOM.normal(size=50)
+    unit, scale = unit_columns(COLUMNS)
+    assert np.linalg.norm(unit, axis=0) == pytest.approx(1.0)
+    assert unit * scale == pytest.approx(COLUMNS)
+    assert unit.T @ unexplained(COLUMNS, values) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_column_of_zeros_gets_nothing():
+    columns = np.column_stack([COLUMNS, np.zeros(50)])
+    found = least_squares(columns, COLUMNS[:, 0])
+    assert found[3] == 0.0
+    assert np.all(np.isfinite(found))
+
+
+def test_a_direction_below_the_tolerance_is_left_out():
+    twice = np.column_stack([COLUMNS[:, 1], COLUMNS[:, 1] * (1 + 1e-9), COLUMNS[:, 2]])
+    assert orthonormal(twice, 1e-6).shape == (50, 2)
+    basis = orthonormal(COLUMNS, 1e-6)
+    assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-12)
+    assert unexplained(basis, COLUMNS[:, 0] * 1e9) == pytest.approx(0.0, abs=1e-12)
