@@ -129,7 +129,7 @@ def test_what_was_held_out_did_not_teach_the_model():
     """Of other values where it is held out, the same structure misses just those."""
     problem = problem_of(PAIR)
     held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
-    shifted = replace(problem, seen=problem.output + np.where(held, 1e-6, 0.0))
+    shifted = replace(problem, output=problem.output + np.where(held, 1e-6, 0.0))
     found = best(explored(PAIR)).fit
     assert held_out_rms(shifted, found, held) == pytest.approx(1e-6, rel=0.01)
 
