@@ -146,7 +146,7 @@ def test_a_zero_on_a_pole_is_no_richer():
         dynamics = dipole
 
     spoiled = Cancelling(
-        scaled, chosen.fit.shape, chosen.fit.driven, chosen.fit.background, chosen.fit.residual
+        scaled, chosen.fit.nonlinear, chosen.fit.driven, chosen.fit.background, chosen.fit.residual
     )
     others = [Candidate(spoiled, c.bic) if c.fit is chosen.fit else c for c in candidates]
     again, _ = choose(others, lambda fit: 1.0)
