@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import struct
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,15 +21,23 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
-from rosbags.serde import SerdeError
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
-from omsm_ros.errors import BagError, DataError
+from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.storage import conversions
+from omsm_ros.storage.bag_checks import (
+    check_definition,
+    check_files,
+    check_index,
+    sign_chunks,
+    translated,
+    unpacked_message,
+)
 from omsm_ros.storage.conversions import Messages
+from omsm_ros.storage.files import said
 
 AXES_TOPIC = "/omsm/axes"
 DISTANCE_TOPIC = "/omsm/confocal"
@@ -56,19 +64,7 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     POINTS_TOPIC: conversions.cloud_array,
 }
 
-# What rosbags raises on bytes that are not what they claim to be.
-_MALFORMED = (
-    ReaderError,
-    SerdeError,
-    ValueError,
-    LookupError,
-    AssertionError,
-    struct.error,
-    OSError,
-    EOFError,
-    OverflowError,
-    MemoryError,  # a length field that claims more than there is
-)
+_DAMAGED = "record it again, or recover what is left of it with the mcap tool"
 
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
 
@@ -134,15 +130,18 @@ class BagReader:
         self._stack = ExitStack()
 
     def __enter__(self) -> BagReader:
-        if not self.path.exists():
-            raise BagError(f"no bag at {str(self.path)!r}; check the path")
-        try:
+        whole = "expected a rosbag2 folder or an .mcap file that was closed properly"
+        with translated(self.path, whole):
+            if not self.path.exists():
+                raise BagError(f"no bag at {str(self.path)!r}; check the path")
+            check_files(self.path)
             self._reader = self._stack.enter_context(Reader(self.path))
-        except _MALFORMED as err:
-            raise BagError(
-                f"{str(self.path)!r} is not a readable bag ({err}); expected a rosbag2 folder or "
-                "an .mcap file that was closed properly"
-            ) from err
+            check_index(self.path, self._reader)
+        self._compressed = self._reader.compression_mode == "message"
+        if self._compressed:
+            # Unpacked here, to a bound; rosbags would unpack whatever comes.
+            metadata = self._reader.storage.metadata
+            self._reader.storage.metadata = metadata._replace(compression_mode=None)
         return self
 
     def __exit__(
@@ -154,9 +153,11 @@ class BagReader:
         self._stack.close()
 
     def topics(self) -> list[TopicSummary]:
-        """What is in the bag, by topic name."""
-        found = [TopicSummary(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
-        return sorted(found, key=lambda summary: summary.topic)
+        """What is in the bag, by topic name; the channels of a topic count as one."""
+        counts: Counter[tuple[str, str]] = Counter()
+        for connection in self._reader.connections:
+            counts[connection.topic, connection.msgtype] += connection.msgcount
+        return [TopicSummary(*names, count) for names, count in sorted(counts.items())]
 
     def count(self, topics: Sequence[str]) -> int:
         """Number of messages on ``topics``."""
@@ -167,43 +168,52 @@ class BagReader:
 
         Raises BagError if one of ``topics`` is absent, of another type, or malformed.
         """
-        connections = [self._connection(topic) for topic in topics]
-        try:
-            for connection, _, raw in self._reader.messages(connections):
+        connections = [c for topic in topics for c in self._connections(topic)]
+        for connection, raw in self._raw(connections):
+            with translated(self.path, _DAMAGED):
                 message = typestore().deserialize_cdr(raw, connection.msgtype)
-                yield connection.topic, _TO_RECORD[connection.topic](message)
-        except DataError as err:
-            raise BagError(f"{str(self.path)!r} holds a malformed message: {err}") from err
-        except BagError:
-            raise
-        except _MALFORMED as err:
-            raise BagError(
-                f"{str(self.path)!r} is damaged: {type(err).__name__}: {err}; record it again or "
-                "recover what is left of it with the mcap tool"
-            ) from err
+            try:
+                record = _TO_RECORD[connection.topic](message)
+            except (DataError, CalibrationError) as err:
+                raise BagError(f"bag {str(self.path)!r} holds a malformed message: {err}") from err
+            yield connection.topic, record
 
-    def _connection(self, topic: str) -> Connection:
-        held = ", ".join(t.topic for t in self.topics()) or "nothing"
-        for connection in self._reader.connections:
-            if connection.topic == topic:
-                break
-        else:
+    def _raw(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, bytes]]:
+        """Serialised messages, as many as the bag promises."""
+        promised = sum(connection.msgcount for connection in connections)
+        messages = self._reader.messages(connections) if connections else iter(())
+        while True:
+            with translated(self.path, _DAMAGED):
+                if (found := next(messages, None)) is None:
+                    break
+                connection, _, raw = found
+                raw = unpacked_message(raw) if self._compressed else raw
+            promised -= 1
+            yield connection, raw
+        if promised:
+            more_or_less = "fewer" if promised > 0 else "more"
             raise BagError(
-                f"{str(self.path)!r} has no topic {topic!r}; it holds {held}. "
+                f"bag {str(self.path)!r} holds {abs(promised)} messages {more_or_less} than its "
+                f"index says: it is damaged; {_DAMAGED}"
+            )
+
+    def _connections(self, topic: str) -> list[Connection]:
+        found = [c for c in self._reader.connections if c.topic == topic]
+        if not found:
+            held = ", ".join(t.topic for t in self.topics()) or "nothing"
+            raise BagError(
+                f"{str(self.path)!r} has no topic {topic!r}; it holds {held:.500}. "
                 "Record the raw topics of the cell"
             )
-        if connection.msgtype != TOPIC_TYPES[topic]:
-            raise BagError(
-                f"{topic!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
-                f"{TOPIC_TYPES[topic]!r}"
-            )
-        digest = typestore().hash_rihs01(connection.msgtype)
-        if connection.digest and connection.digest != digest:
-            raise BagError(
-                f"{topic!r} in {str(self.path)!r} was recorded with another definition of "
-                f"{connection.msgtype!r} ({connection.digest!r}, expected {digest!r})"
-            )
-        return connection
+        for connection in found:
+            if connection.msgtype != TOPIC_TYPES[topic]:
+                raise BagError(
+                    f"{topic!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
+                    f"{TOPIC_TYPES[topic]!r}; record the topics of the cell"
+                )
+            with translated(self.path, _DAMAGED):
+                check_definition(self.path, connection, typestore())
+        return found
 
 
 # ------------------------------------------------------------------------------ writing
@@ -224,10 +234,13 @@ class BagWriter:
         folder = self.path.parent
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._check_name()
             # In the same folder, so that the last step is a rename and cannot be half done.
-            self._scratch = Path(tempfile.mkdtemp(prefix=f".{self.path.name}-", dir=folder))
-        except OSError as err:
-            raise BagError(f"cannot write {str(self.path)!r}: {err.strerror or err}") from err
+            self._scratch = Path(tempfile.mkdtemp(prefix=".bag-", dir=folder))
+        except (OSError, ValueError) as err:
+            raise BagError(
+                f"cannot write {str(self.path)!r}: {said(err)}; check the folder and its rights"
+            ) from err
         self._writer = Writer(self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         for topic in self._topics:
@@ -235,6 +248,11 @@ class BagWriter:
                 topic, TOPIC_TYPES[topic], typestore=typestore()
             )
         return self
+
+    def _check_name(self) -> None:
+        """OSError for a name that no file can have, before an hour is recorded for it."""
+        with suppress(FileNotFoundError):
+            self.path.lstat()
 
     def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
         """Append one message as it came over the wire, received at ``stamp_ns``."""
@@ -263,6 +281,8 @@ class BagWriter:
         try:
             self._writer.close()
             if kind is None:
-                os.replace(self._scratch / "bag" / "bag.mcap", self.path)
+                written = self._scratch / "bag" / "bag.mcap"
+                sign_chunks(written)
+                os.replace(written, self.path)
         finally:
             shutil.rmtree(self._scratch, ignore_errors=True)

@@ -1,0 +1,149 @@
+"""Is a bag what it claims to be, and can it be read in bounded memory?
+
+A bag comes from anywhere: its index may promise what is not there, its definitions may order the
+fields otherwise than ours, and a few bytes of it may unpack to gigabytes.
+"""
+
+from __future__ import annotations
+
+from binascii import crc32
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from struct import pack, unpack
+
+from lz4.frame import LZ4FrameDecompressor
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError, storage_mcap
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from omsm_ros.errors import BagError
+from omsm_ros.storage.files import open_regular, said
+
+# rosbag2 writes chunks of less than a megabyte, Foxglove of four.
+MAX_CHUNK_BYTES = 128 * 1024**2
+MAX_MESSAGE_BYTES = 128 * 1024**2
+_MAX_METADATA_BYTES = 4 * 1024**2
+_MCAP_MAGIC_BYTES, _RECORD_HEAD_BYTES = 8, 9
+_CHUNK, _CRC_AT, _COMPRESSION_AT = 6, 24, 28
+
+
+@contextmanager
+def translated(path: Path, remedy: str) -> Iterator[None]:
+    """Raise BagError for whatever the libraries say of a bag's bytes.
+
+    They raise what their parts raise: struct.error, ZstdError, RuntimeError, AssertionError, …
+    """
+    try:
+        yield
+    except BagError:
+        raise
+    except Exception as err:
+        raise BagError(
+            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {said(err)}; {remedy}"
+        ) from err
+
+
+def check_files(path: Path) -> None:
+    """Raise BagError unless ``path`` is a regular file or a folder of such."""
+    for part in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if not part.is_dir():
+            open_regular(part, BagError, "bag").close()
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and metadata.stat().st_size > _MAX_METADATA_BYTES:
+        raise BagError(f"bag {str(path)!r} has metadata of more than {_MAX_METADATA_BYTES} bytes")
+
+
+def check_index(path: Path, reader: Reader) -> None:
+    """Raise BagError for an index whose chunks are too large, or the same one many times."""
+    storage = reader.storage
+    for part in getattr(storage, "storages", [storage]):
+        chunks = getattr(part, "chunks", [])
+        places = {chunk.chunk_start_offset for chunk in chunks}
+        largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
+        if len(places) < len(chunks) or largest > MAX_CHUNK_BYTES:
+            raise BagError(
+                f"bag {str(path)!r} has an index of {len(chunks)} chunks at {len(places)} places, "
+                f"the largest of {largest} bytes, expected each once and at most "
+                f"{MAX_CHUNK_BYTES} bytes; write it again with smaller chunks"
+            )
+
+
+def check_definition(path: Path, connection: Connection, ours: Typestore) -> None:
+    """Raise BagError if the bag's definition of a message is not the one that we read it by."""
+    expected = ours.hash_rihs01(connection.msgtype)
+    found = {connection.digest, _hash_of(connection.msgdef, connection.msgtype)} - {"", expected}
+    if found:
+        raise BagError(
+            f"{connection.topic!r} in {str(path)!r} was recorded with another definition of "
+            f"{connection.msgtype!r} ({found.pop()!r}, expected {expected!r}); record it again, or "
+            "convert it"
+        )
+
+
+@lru_cache(maxsize=64)
+def _hash_of(definition: MessageDefinition, name: str) -> str:
+    """RIHS01 of a definition that a bag carries; empty if it carries none."""
+    if definition.format is MessageDefinitionFormat.NONE:
+        return ""
+    store = get_typestore(Stores.EMPTY)
+    if definition.format is MessageDefinitionFormat.MSG:
+        store.register(get_types_from_msg(definition.data, name))
+    else:
+        store.register(get_types_from_idl(definition.data))
+    return store.hash_rihs01(name)
+
+
+# ---------------------------------------------------------------------------- unpacking
+
+
+def unpacked_message(data: bytes) -> bytes:
+    """Return a message that was compressed by itself; ReaderError if it is too long."""
+    return _zstd(data, MAX_MESSAGE_BYTES, exactly=False)
+
+
+def _zstd(data: bytes, size: int, exactly: bool = True) -> bytes:
+    return _bounded(storage_mcap.zstd.ZstdDecompressor().decompress, data, size, exactly)
+
+
+def _lz4(data: bytes, size: int) -> bytes:
+    return _bounded(LZ4FrameDecompressor().decompress, data, size, True)
+
+
+def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: bool) -> bytes:
+    if size > MAX_CHUNK_BYTES:
+        raise ReaderError(f"a chunk claims {size} bytes, at most {MAX_CHUNK_BYTES} are accepted")
+    raw = decompress(data, max_length=size + 1)
+    if len(raw) > size or (exactly and len(raw) < size):
+        raise ReaderError(f"a chunk claims {size} bytes and does not unpack to that many")
+    return raw
+
+
+# rosbags unpacks whatever comes out, and looks at its size afterwards.
+storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
+
+
+# ------------------------------------------------------------------------------ signing
+
+
+def sign_chunks(path: Path) -> None:
+    """Write the checksum of each chunk into an uncompressed MCAP file that has none.
+
+    Readers then see a changed byte; the format is that of mcap.dev/spec, "Chunk (op=0x06)".
+    """
+    with path.open("r+b") as stream:
+        stream.seek(_MCAP_MAGIC_BYTES)
+        while len(head := stream.read(_RECORD_HEAD_BYTES)) == _RECORD_HEAD_BYTES:
+            kind, length = unpack("<BQ", head)
+            start = stream.tell()
+            if kind == _CHUNK:
+                stream.seek(start + _COMPRESSION_AT)
+                named, size = unpack("<IQ", stream.read(12))
+                if named:
+                    raise BagError(f"{str(path)!r} is compressed; sign what is not")
+                checksum = crc32(stream.read(size))
+                stream.seek(start + _CRC_AT)
+                stream.write(pack("<I", checksum))
+            stream.seek(start + length)
