@@ -20,8 +20,11 @@ def ros():
 @pytest.fixture
 def cell(tmp_path):
     """Start nodes, look at their diagnostics, call their services; all end with the test."""
+    from sensor_msgs.msg import PointCloud2
+
     from omsm_ros.nodes.cell_demo_node import DemoNode
     from omsm_ros.nodes.processes import NodeProcesses
+    from omsm_ros.nodes.running import SAMPLES_QOS
 
     class Cell:
         link = str(tmp_path / "port")
@@ -40,6 +43,18 @@ def cell(tmp_path):
 
         def wait(self, what, done):
             self.operator.wait_until(what, done)
+
+        def publisher(self, topic, message, listeners=1):
+            """A publisher of samples that ``listeners`` nodes have found."""
+            made = self.operator.create_publisher(message, f"/omsm/{topic}", SAMPLES_QOS)
+            self.wait(f"who hears {topic}", lambda: made.get_subscription_count() >= listeners)
+            return made
+
+        def clouds(self):
+            """A list that fills with what appears on /omsm/points while the operator spins."""
+            seen = []
+            self.operator.create_subscription(PointCloud2, "/omsm/points", seen.append, SAMPLES_QOS)
+            return seen
 
         def settle(self, node, key):
             """Wait until a count has stood still for a second and return it."""

@@ -1,0 +1,228 @@
+"""The corrector alone, live: what it refuses, what it says of what it was forced to use, where
+its points lie, and what it predicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from omsm_msgs.msg import AxisBlock as AxisMessage
+from omsm_msgs.msg import Calibration as CalibrationMessage
+from omsm_msgs.msg import DistanceBlock as DistanceMessage
+from omsm_msgs.srv import LoadCalibration, PredictError
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.nodes.running import LATCHED_QOS
+from omsm_ros.storage import bags, conversions
+from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.twin.cell import blocks_of
+
+pytestmark = pytest.mark.timeout(120)
+
+PERIOD, COUNT = 1e-3, 600
+
+
+def blocks(z=None, distance=None, first=0, **axes):
+    """One block of each stream; channels that are not given are zero."""
+    zero = np.zeros(COUNT)
+    common = {"stamp_ns": first * 1_000_000, "first_sample": first, "sample_period": PERIOD}
+    channels = {name: axes.get(name, zero) for name in "xybc"}
+    return (
+        AxisBlock(**common, z=zero if z is None else z, **channels),
+        DistanceBlock(**common, distance=zero if distance is None else distance),
+    )
+
+
+class Feed:
+    """Publishes pairs of blocks to the corrector, and reads its clouds."""
+
+    def __init__(self, cell):
+        self._cell, self._messages = cell, conversions.ros_messages()
+        self.clouds = cell.clouds()
+        self._axes = cell.publisher("axes", AxisMessage)
+        self._distance = cell.publisher("confocal", DistanceMessage)
+
+    def send(self, axes, distance):
+        self._axes.publish(conversions.axis_message(self._messages, axes))
+        self._distance.publish(conversions.distance_message(self._messages, distance))
+
+    def answer(self, axes, distance):
+        """The next cloud."""
+        self.clouds.clear()
+        self.send(axes, distance)
+        self._cell.wait("a cloud", lambda: self.clouds)
+        return self.clouds[0]
+
+
+def saved(cell, name, calibration):
+    path = cell.folder / name
+    save_calibration(path, calibration)
+    return str(path)
+
+
+FOREIGN = {"machine": "another", "exposure_s": 5e-4}
+
+
+def test_settings_that_differ_are_refused_on_every_way_in(cell, true_calibration):
+    """By the service with the reason, from the topic with a word in the log, and nothing flows."""
+    cell.processes.start("corrector", settings='{"machine": "another"}')
+    feed = Feed(cell)
+    path = saved(cell, "foreign.json", true_calibration)
+    answer = cell.call(LoadCalibration, "corrector/load_calibration", path=path)
+    assert not answer.success
+    assert "machine is 'another', calibrated with 'twin'" in answer.message
+    assert "override" in answer.message
+    assert answer.id == ""
+
+    latched = cell.operator.create_publisher(CalibrationMessage, "/omsm/calibration", LATCHED_QOS)
+    latched.publish(
+        conversions.calibration_message(conversions.ros_messages(), true_calibration, 0)
+    )
+    log = cell.folder / "log" / "corrector.log"
+    cell.wait("the refusal", lambda: "calibration refused" in log.read_text())
+    feed.send(*blocks())
+    cell.wait("the count", lambda: cell.operator.value("corrector", "axes_uncalibrated") == COUNT)
+    assert feed.clouds == []
+    assert cell.operator.value("corrector", "clouds_published") == 0
+
+    own = replace(true_calibration, settings={"machine": "another"})
+    answer = cell.call(
+        LoadCalibration, "corrector/load_calibration", path=saved(cell, "own.json", own)
+    )
+    assert answer.success, answer.message
+    assert answer.id == own.id
+    assert feed.answer(*blocks(first=10_000)).header.frame_id == "workpiece"
+
+
+def test_a_refused_calibration_leaves_the_one_in_force(cell, true_calibration):
+    cell.processes.start("corrector", calibration=saved(cell, "good.json", true_calibration))
+    rejected = replace(true_calibration, certificate={"verdict": "rejected", "reasons": ["loose"]})
+    answer = cell.call(
+        LoadCalibration, "corrector/load_calibration", path=saved(cell, "bad.json", rejected)
+    )
+    assert not answer.success
+    assert "loose" in answer.message
+    assert answer.id == true_calibration.id
+    cell.wait(
+        "who is in force",
+        lambda: cell.operator.text("corrector", "calibration") == true_calibration.id,
+    )
+
+
+def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_calibration):
+    """A viewer that waits for the usual frame shows nothing; one that belongs ends it."""
+    path = saved(cell, "cal.json", true_calibration)
+    settings = '{"machine": "another"}'
+    cell.processes.start("corrector", calibration=path, settings=settings, override=True)
+    feed = Feed(cell)
+    for number in range(2):
+        cloud = feed.answer(*blocks(first=number * COUNT))
+        assert cloud.header.frame_id == "workpiece_overridden"
+    cell.wait(
+        "the warning", lambda: "does not belong" in cell.operator.text("corrector", "message")
+    )
+    own = replace(true_calibration, settings={"machine": "another"})
+    answer = cell.call(
+        LoadCalibration, "corrector/load_calibration", path=saved(cell, "own.json", own)
+    )
+    assert answer.success, answer.message
+    assert feed.answer(*blocks(first=10_000)).header.frame_id == "workpiece"
+    cell.wait("no warning", lambda: cell.operator.text("corrector", "message") == "correcting")
+
+
+def test_geometry_parameters_place_the_points(cell, true_calibration):
+    """At rest in z, a point is where rotation matrices put it, and H(z) is z."""
+    given = {
+        "centre_x": 1e-3, "centre_y": -2e-3, "probe_x": 5e-3, "probe_z": 20e-3,
+        "beam_x": 0.02, "beam_y": -0.01,
+    }  # fmt: skip
+    cell.processes.start(
+        "corrector",
+        calibration=saved(cell, "cal.json", true_calibration),
+        **{f"geometry.{name}": value for name, value in given.items()},
+    )
+    feed = Feed(cell)
+    time = np.arange(COUNT) * PERIOD
+    x, y, c = 8e-3 - 1e-3 * time, 1e-4 * time, np.pi * time
+    b, z, reading = 0.1 + 0.05 * time, 0.4e-3, 20e-6
+    cloud = feed.answer(
+        *blocks(z=np.full(COUNT, z), distance=np.full(COUNT, reading), x=x, y=y, b=b, c=c)
+    )
+    points = conversions.cloud_array(cloud)
+    assert len(points) > COUNT - 50
+    beam = np.array([given["beam_x"], given["beam_y"], 1.0])
+    beam /= np.linalg.norm(beam)
+    rest = np.array([given["probe_x"], 0.0, given["probe_z"]])
+    for point in points[:: len(points) // 7]:
+        k = point["sample"]
+        about_y = np.array(
+            [[np.cos(b[k]), 0, np.sin(b[k])], [0, 1, 0], [-np.sin(b[k]), 0, np.cos(b[k])]]
+        )
+        about_z = np.array([[np.cos(c[k]), np.sin(c[k])], [-np.sin(c[k]), np.cos(c[k])]])
+        reach = about_y @ (rest + beam * reading / true_calibration.static_gain) - rest
+        slide = np.array([x[k] - given["centre_x"], y[k] - given["centre_y"]])
+        expected = about_z @ (slide + reach[:2])
+        np.testing.assert_allclose([point["x"], point["y"]], expected, atol=2e-9)
+        assert point["height"] == pytest.approx(z + reach[2], abs=1e-12)
+
+
+def test_predict_error_of_a_sine_is_that_of_its_frequency(cell, true_calibration, tmp_path):
+    """2 A |1 − G(jω)| from peak to valley; and the same from a bag."""
+    cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
+    amplitude, frequency = 0.3e-3, 2.0
+    z = amplitude * np.sin(2 * np.pi * frequency * np.arange(5000) * PERIOD)
+    ask = {"sample_period": PERIOD, "z": z.tolist()}
+    answer = cell.call(PredictError, "corrector/predict_error", **ask)
+    lost = abs(1 - true_calibration.dynamics.response([frequency])[0])
+    assert answer.safe, answer.message
+    assert answer.peak_to_valley == pytest.approx(2 * amplitude * lost, rel=1e-3)
+    # Without what settles, the last turn is not a whole one.
+    assert answer.rms == pytest.approx(amplitude * lost / np.sqrt(2), rel=5e-3)
+    assert answer.outside_band_fraction < 1e-6
+    assert "within the budget" in answer.message
+
+    bag = tmp_path / "motion.mcap"
+    zero = np.zeros(5000)
+    with bags.BagWriter(bag, (bags.AXES_TOPIC,)) as writer:
+        for first in range(0, 5000, 500):
+            writer.write_axes(
+                AxisBlock(
+                    stamp_ns=first * 1_000_000,
+                    first_sample=first,
+                    sample_period=PERIOD,
+                    z=z[first : first + 500],
+                    **dict.fromkeys("xybc", zero[:500]),
+                )
+            )
+    from_bag = cell.call(PredictError, "corrector/predict_error", bag=str(bag))
+    assert from_bag.peak_to_valley == answer.peak_to_valley
+    assert from_bag.rms == answer.rms
+
+    shaken = z + 1e-6 * np.sin(2 * np.pi * 180.0 * np.arange(5000) * PERIOD)
+    ask = {"sample_period": PERIOD, "z": shaken.tolist()}
+    answer = cell.call(PredictError, "corrector/predict_error", **ask)
+    assert not answer.safe
+    # Mean square velocity of one sine over that of both.
+    share = (1e-6 * 180.0) ** 2 / ((1e-6 * 180.0) ** 2 + (amplitude * frequency) ** 2)
+    assert answer.outside_band_fraction == pytest.approx(share, rel=0.02)
+
+
+def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
+    """Bit for bit, whatever was between: messages, DDS, blocks."""
+    from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+    from omsm_ros.core.correction.surface_points import pack_points
+    from omsm_ros.core.correction.uncertainty import sources_with
+
+    cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
+    feed = Feed(cell)
+    pairs = blocks_of(small_scan)[:30]
+    options = CorrectionOptions(sources=sources_with(true_calibration, {}))
+    corrector = Corrector(true_calibration, options)
+    parts = []
+    for axes, distance in pairs:
+        feed.send(axes, distance)
+        corrector.push_axes(axes)
+        corrector.push_distance(distance)
+        parts.append(corrector.take())
+    expected = pack_points(join_points([part for part in parts if part is not None]))
+    cell.wait("the clouds", lambda: sum(c.width for c in feed.clouds) >= len(expected))
+    assert b"".join(bytes(cloud.data) for cloud in feed.clouds) == expected.tobytes()
