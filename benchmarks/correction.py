@@ -14,8 +14,8 @@ import numpy as np
 from scipy import signal
 
 from benchmarks.row import Row, at_least, at_most, not_compared
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
@@ -26,7 +26,7 @@ from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.verification.reversal import sideways_lag
+from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
 from omsm_ros.twin.cell import Cell, Recording, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.scenario import Scenario, step_test_of
@@ -312,7 +312,8 @@ def lateral_lag() -> list[Row]:
     scans = []
     for speed, seed in ((30.0, 1), (-30.0, 2)):
         made = scan(speed, seed, cell)
-        scans.append(corrected(calibration, made.axes, made.distance, lateral_lag=0.0))
+        points = corrected(calibration, made.axes, made.distance, lateral_lag=0.0)
+        scans.append(ScanPath.of(points, 1e-3))
     found = sideways_lag(scans, calibration)
     error = abs(found.lag - latency)
     put_right = corrected(calibration, made.axes, made.distance, lateral_lag=found.lag)

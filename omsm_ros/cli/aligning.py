@@ -26,7 +26,8 @@ def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("correcting", args.json) as progress:
         bags = (args.clockwise, args.counterclockwise)
-        return asdict(sideways_lag_of(bags, calibration, progress))
+        found, accounts = sideways_lag_of(bags, calibration, progress)
+    return asdict(found) | {"samples": [account.as_dict() for account in accounts]}
 
 
 _MEANINGS = {
@@ -44,6 +45,7 @@ def _show_reversal(facts: Facts) -> None:
             ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
             ("meaning", _MEANINGS[facts["latency"]]),
             ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
+            ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
         ]
     )  # fmt: skip
 
@@ -63,7 +65,7 @@ def _align(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     known = geometry_of(args.geometry)
     with progress_bar("correcting", args.json) as progress:
-        found = alignment_of(args.bag, calibration, args.radius, known, progress)
+        found, account = alignment_of(args.bag, calibration, args.radius, known, progress)
     save_geometry(args.out, found.geometry)
     names = ("centre_x", "centre_y", "beam_x", "beam_y")
     # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.
@@ -73,6 +75,8 @@ def _align(args: argparse.Namespace) -> Facts:
         "uncertainty": dict(zip(names, spread, strict=True)),
         "residual": found.residual,
         "beam_found": found.beam_found,
+        "used": found.used,
+        "samples": account.as_dict(),
         "file": str(args.out),
     }
 
@@ -87,6 +91,8 @@ def _show_align(facts: Facts) -> None:
         )
         rows.append((name, f"{value / unit:.4f} {text} {stated}"))
     rows.append(("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"))
+    corrected = facts["samples"]["axes"]["corrected"]
+    rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
     table([*rows, ("written to", facts["file"])])
 
 

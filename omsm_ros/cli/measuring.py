@@ -11,9 +11,9 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.correction.uncertainty import sources_with
 from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.jobs.correct_bag import ByStamps
+from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
-from omsm_ros.jobs.measure import Admission, measure
+from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.read_bag import motion_in
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.machine_files import load_geometry, load_surface

@@ -1,62 +1,58 @@
-"""What the commands and the nodes do with a recorded bag.
+"""From a recorded bag to a cloud, and to all that is said of it, in one pass.
 
-``bag → records → core → cloud.ply, summary.json, report.html``
+``bag → blocks → core → cloud.ply`` and the figures of the summary
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import (
-    AxisBlock,
-    Block,
-    DistanceBlock,
-    follows,
-    join_axes,
-    join_distance,
-)
-from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
+from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
+from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
+from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.read_bag import Progress, no_progress
-from omsm_ros.storage import bags
 from omsm_ros.storage.cloud_file import PlyWriter
 
-_GATHERED_BLOCKS = 32
+# No picture has so many pixels; the numbers of a summary come from all points.
+MOST_DRAWN = 1_000_000
+# A quarter of an hour at 1 kHz shows how a machine moves; of a spiral it is the fastest part.
+MOST_JUDGED = 2**20
 
 
-# ---------------------------------------------------------------------------- correction
-
-
-@dataclass(frozen=True)
-class ByStamps:
-    """Probe and axes joined by their stamps, not by a common trigger counter.
-
-    delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
-    exposure: over which the probe averages [s]
-    """
-
-    delay: float = 0.0
-    exposure: float = 0.0
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
     """What became of a bag.
 
     account: of every sample, by stream;  budget: rms of each source of uncertainty [m]
     stamp_skew: of the two streams' stamps for the same trigger [s], None if none was paired
+    admission, reasons: how the calibration was admitted, and what spoke against it
+    statistics: of the dynamic "error", and with a nominal surface of the "raw" and "corrected"
+        deviation, over all points; empty without points
+    largest_uncertainty: [m];  points: evenly chosen, as in the cloud;  motion: z [m] (n,)
+    sample_period: [s]
     """
 
     account: dict[str, Any]
     budget: dict[str, float]
     stamp_skew: float | None
+    admission: dict[str, object]
+    reasons: tuple[str, ...]
+    statistics: dict[str, FormStatistics]
+    largest_uncertainty: float
+    points: NDArray[np.void]
+    motion: FloatArray
+    sample_period: float
 
 
 def correct_bag(
@@ -65,10 +61,10 @@ def correct_bag(
     cloud: Path,
     *,
     options: CorrectionOptions | None = None,
+    admission: Admission | None = None,
     nominal: Surface | None = None,
     lateral: float = 0.0,
     by_stamps: ByStamps | None = None,
-    comment: str = "",
     progress: Progress = no_progress,
 ) -> Correction:
     """Correct a bag into ``cloud`` (PLY).
@@ -76,64 +72,84 @@ def correct_bag(
     nominal, lateral: surface, and standard uncertainty of a point sideways [m], which costs
         height where the surface slopes
     by_stamps: join the streams by their stamps; None: by the trigger counter they share
+
     Memory does not grow with the bag, but for ``by_stamps``. Leaves no cloud behind when it fails.
+    Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
     """
-    corrector = Corrector(calibration, options or CorrectionOptions())
-    topics = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
-    with (
-        bags.BagReader(path) as bag,
-        PlyWriter(cloud, f"omsm_ros, metres, calibration {calibration.id} {comment}") as ply,
-    ):
-        total = bag.count(topics)
-
-        def write(points: SurfacePoints | None) -> None:
-            if points is not None:
-                ply.write(with_lateral(points, nominal, lateral) if nominal and lateral else points)
-
-        records = bag.records(*topics)
-        if by_stamps is not None:
-            records = _joined_by_stamps(records, by_stamps)
-        for done, record in _gathered(records):
-            if isinstance(record, AxisBlock):
-                corrector.push_axes(record)
-            elif isinstance(record, DistanceBlock):
-                corrector.push_distance(record)
-            write(corrector.take())
-            progress(done, total)
-        write(corrector.finish())
-    account = dict(corrector.account.as_dict())
-    return Correction(account, corrector.budget, corrector.stamp_skew)
-
-
-def _joined_by_stamps(records: Iterable[bags.Item], how: ByStamps) -> Iterator[bags.Item]:
-    """The axes at the probe's samples, and the probe's blocks, as if one trigger had both."""
-    axes, distance = [], []
-    for _, block in records:
-        if isinstance(block, AxisBlock):
-            axes.append(block)
-        elif isinstance(block, DistanceBlock):
-            distance.append(block)
-    moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
-    for axis_block, reading in zip(moved, distance, strict=True):
-        yield bags.AXES_TOPIC, axis_block
-        yield bags.DISTANCE_TOPIC, reading
+    scan = CorrectedScan(
+        path,
+        calibration,
+        options or CorrectionOptions(),
+        admission=admission or Admission(),
+        by_stamps=by_stamps,
+        progress=progress,
+    )
+    with scan:
+        overridden = "; ".join(["OVERRIDDEN", *scan.reasons]) if scan.reasons else ""
+        comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
+        with PlyWriter(cloud, comment) as ply:
+            found = _Findings(nominal)
+            for block, points in scan.steps():
+                if isinstance(block, AxisBlock):
+                    found.motion.append(block.z)
+                if points is not None:
+                    if nominal is not None and lateral:
+                        points = with_lateral(points, nominal, lateral)
+                    found.add(points, ply.write(points))
+        return Correction(
+            account=scan.account.as_dict(),
+            budget=scan.budget,
+            stamp_skew=scan.stamp_skew,
+            admission=scan.admitted,
+            reasons=scan.reasons,
+            statistics=found.statistics(),
+            largest_uncertainty=found.largest,
+            points=found.drawn.rows(),
+            motion=found.motion.first(),
+            sample_period=scan.sample_period,
+        )
 
 
-def _gathered(records: Iterable[bags.Item]) -> Iterator[tuple[int, Block]]:
-    """Blocks of a bag joined into long ones, and how many messages have been read.
+class _Start:
+    """The first ``most`` values of a stream."""
 
-    The result of a correction does not depend on how its samples were cut; its speed does.
-    """
-    waiting: dict[type[Block], list[Any]] = {AxisBlock: [], DistanceBlock: []}
-    done = 0
-    for done, (_, record) in enumerate(records, start=1):
-        blocks = waiting[type(record)]
-        if blocks and not (len(blocks) < _GATHERED_BLOCKS and follows(record, blocks[-1])):
-            yield done, _join(blocks)
-            blocks.clear()
-        blocks.append(record)
-    yield from ((done, _join(blocks)) for blocks in waiting.values() if blocks)
+    def __init__(self, most: int) -> None:
+        self._missing = most
+        self._parts: list[FloatArray] = []
+
+    def append(self, values: FloatArray) -> None:
+        if self._missing > 0:
+            self._parts.append(values[: self._missing])
+            self._missing -= len(values)
+
+    def first(self) -> FloatArray:
+        return np.concatenate(self._parts) if self._parts else np.empty(0)
 
 
-def _join(blocks: list[Any]) -> Block:
-    return join_axes(blocks) if isinstance(blocks[0], AxisBlock) else join_distance(blocks)
+class _Findings:
+    """What is learnt of the points while they pass."""
+
+    def __init__(self, nominal: Surface | None) -> None:
+        self._nominal = nominal
+        names = ("error",) if nominal is None else ("error", "raw", "corrected")
+        self._running = {name: RunningStatistics() for name in names}
+        self.largest = 0.0
+        self.drawn = EvenSelection(MOST_DRAWN)
+        self.motion = _Start(MOST_JUDGED)
+
+    def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
+        self.drawn.add(packed)
+        if not len(points):
+            return
+        self.largest = max(self.largest, float(points.uncertainty.max()))
+        x, y, error = points.x, points.y, points.dynamic_error
+        self._running["error"].add(x, y, error)
+        if self._nominal is not None:
+            corrected = deviation(x, y, points.height, self._nominal)
+            self._running["corrected"].add(x, y, corrected)
+            self._running["raw"].add(x, y, corrected + error)
+
+    def statistics(self) -> dict[str, FormStatistics]:
+        if not len(self.drawn):
+            return {}
+        return {name: running.statistics() for name, running in self._running.items()}

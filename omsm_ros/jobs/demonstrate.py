@@ -125,14 +125,13 @@ _RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
 def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
-    done = correct_bag(plan.bag, calibration, plan.out / CLOUD)
-    stored = CloudFile(plan.out / CLOUD)
-    cloud = stored.read()
+    done = correct_bag(plan.bag, calibration, plan.out / CLOUD, nominal=PAPER_MIRROR)
+    cloud = CloudFile(plan.out / CLOUD).read()
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario)
-    summary = measurement.summarise(plan.bag, done, stored, calibration, PAPER_MIRROR)
+    summary = measurement.summarise(plan.bag, done, calibration)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before

@@ -19,9 +19,6 @@ from omsm_ros.report.measurement.gallery import surface_figures
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.storage.files import REPORT, save_text
 
-MOST_DRAWN = 1_000_000
-"""Points a figure is drawn from: no picture has so many pixels, and all numbers come from all."""
-
 
 def figures_of(
     cloud: NDArray[np.void],

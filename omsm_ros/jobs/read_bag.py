@@ -35,14 +35,6 @@ def read_blocks(
     return found
 
 
-def sample_period_of(path: Path) -> float:
-    """Sample period of the probe in a bag [s], from the first block."""
-    with bags.BagReader(path) as bag:
-        for _, block in bag.records(bags.DISTANCE_TOPIC):
-            return float(block.sample_period)
-    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
-
-
 # ------------------------------------------------------------------------------- preview
 
 
@@ -54,7 +46,7 @@ def motion_in(
     samples, period = 0, 0.0
     with bags.BagReader(path) as bag:
         total = bag.count([bags.AXES_TOPIC])
-        for done, (_, block) in enumerate(bag.records(bags.AXES_TOPIC), start=1):
+        for done, _, block in bag.blocks(bags.AXES_TOPIC):
             found.append(block.z)
             samples, period = samples + len(block), block.sample_period
             progress(done, total)

@@ -5,51 +5,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.surface.alignment import Alignment, align_on_sphere, sphere_scan_of
-from omsm_ros.core.verification.reversal import SidewaysLag, sideways_lag
+from omsm_ros.core.samples.accounts import Account
+from omsm_ros.core.samples.blocks import AxisBlock
+from omsm_ros.core.surface.alignment import Alignment, SphereScanReader, align_on_sphere
+from omsm_ros.core.verification.reversal import ScanPath, SidewaysLag, sideways_lag
 from omsm_ros.errors import BagError
-from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
-from omsm_ros.storage import bags
+from omsm_ros.jobs.corrected_scan import CorrectedScan
+from omsm_ros.jobs.read_bag import Progress, no_progress
 
-# ------------------------------------------------------------------- scans as a whole
-
-
-def scan_points(
-    path: Path,
-    calibration: Calibration,
-    options: CorrectionOptions,
-    progress: Progress = no_progress,
-) -> tuple[SurfacePoints, list[AxisBlock]]:
-    """All corrected points of a bag in memory, and the axes they came from."""
-    blocks = read_blocks(path, [bags.AXES_TOPIC, bags.DISTANCE_TOPIC], progress)
-    axes = [b for b in blocks[bags.AXES_TOPIC] if isinstance(b, AxisBlock)]
-    corrector = Corrector(calibration, options)
-    for block in axes:
-        corrector.push_axes(block)
-    for reading in blocks[bags.DISTANCE_TOPIC]:
-        if isinstance(reading, DistanceBlock):
-            corrector.push_distance(reading)
-    points = join_points([corrector.take(), corrector.finish()])
-    if not len(points):
-        raise BagError(
-            f"{str(path)!r} gives no surface point: {corrector.account.as_dict()!r}; "
-            "look at it with 'omsm inspect'"
-        )
-    return points, axes
+# What is to be found must not be in the points already.
+_PLAIN = CorrectionOptions(lateral_lag=0.0)
 
 
 def sideways_lag_of(
     bag_paths: Sequence[Path], calibration: Calibration, progress: Progress = no_progress
-) -> SidewaysLag:
-    """Lag of the probe against X and C from scans with opposite spindle directions."""
-    options = CorrectionOptions(lateral_lag=0.0)
-    scans = [scan_points(path, calibration, options, progress)[0] for path in bag_paths]
-    return sideways_lag(scans, calibration)
+) -> tuple[SidewaysLag, list[Account]]:
+    """Lag of the probe against X and C from scans with opposite spindle directions.
+
+    Also return where every sample of each scan has gone.
+    """
+    paths, accounts = [], []
+    for bag in bag_paths:
+        with CorrectedScan(bag, calibration, _PLAIN, progress=progress) as scan:
+            path = ScanPath(scan.sample_period)
+            for _, points in scan.steps():
+                if points is not None:
+                    path.add(points)
+            _check_points(scan)
+            paths.append(path)
+            accounts.append(scan.account)
+    return sideways_lag(paths, calibration), accounts
 
 
 def alignment_of(
@@ -58,8 +46,25 @@ def alignment_of(
     radius: float,
     geometry: Geometry,
     progress: Progress = no_progress,
-) -> Alignment:
-    """Spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m]."""
-    options = CorrectionOptions(lateral_lag=0.0)
-    points, axes = scan_points(path, calibration, options, progress)
-    return align_on_sphere(sphere_scan_of(points, axes), radius, geometry)
+) -> tuple[Alignment, Account]:
+    """Spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m].
+
+    Also return where every sample of the scan has gone.
+    """
+    reader = SphereScanReader()
+    with CorrectedScan(path, calibration, _PLAIN, progress=progress) as scan:
+        for block, points in scan.steps():
+            if isinstance(block, AxisBlock):
+                reader.add_axes(block)
+            if points is not None:
+                reader.add(points)
+        _check_points(scan)
+        return align_on_sphere(reader.scan(), radius, geometry), scan.account
+
+
+def _check_points(scan: CorrectedScan) -> None:
+    if not scan.account.axes.corrected:
+        raise BagError(
+            f"{str(scan.path)!r} gives no surface point: {scan.account.as_dict()!r}; "
+            "look at it with 'omsm inspect'"
+        )

@@ -10,10 +10,11 @@ import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
@@ -36,6 +37,7 @@ from omsm_ros.storage.bag_checks import (
     translated,
     unpacked_message,
 )
+from omsm_ros.storage.block_table import long_blocks
 from omsm_ros.storage.conversions import Messages
 from omsm_ros.storage.files import said
 
@@ -65,6 +67,16 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
 }
 
 _DAMAGED = "record it again, or recover what is left of it with the mcap tool"
+
+_BLOCKS: dict[str, type] = {
+    AXES_TOPIC: AxisBlock,
+    DISTANCE_TOPIC: DistanceBlock,
+    REFERENCE_TOPIC: DistanceBlock,
+}
+
+# Of messages that are joined: a long block costs little more than a short one, and this one
+# with all that is computed of it still fits into the caches of a core.
+_JOINED_BYTES = 1_000_000
 
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
 
@@ -170,26 +182,55 @@ class BagReader:
         """
         connections = [c for topic in topics for c in self._connections(topic)]
         for connection, raw in self._raw(connections):
-            with translated(self.path, _DAMAGED):
-                message = typestore().deserialize_cdr(raw, connection.msgtype)
-            try:
-                record = _TO_RECORD[connection.topic](message)
-            except (DataError, CalibrationError) as err:
-                raise BagError(f"bag {str(self.path)!r} holds a malformed message: {err}") from err
-            yield connection.topic, record
+            yield connection.topic, self._record(connection.topic, raw)
+
+    def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
+        """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.
+
+        The blocks of a topic keep their order. Raises BagError as :meth:`records` does.
+        """
+        connections = [c for topic in topics for c in self._connections(topic)]
+        waiting: dict[str, list[bytes]] = {}
+        size = read = 0
+        for connection, raw in self._raw(connections):
+            waiting.setdefault(connection.topic, []).append(raw)
+            size, read = size + len(raw), read + 1
+            if size >= _JOINED_BYTES:
+                yield from ((read, *item) for item in self._joined(waiting))
+                waiting, size = {}, 0
+        yield from ((read, *item) for item in self._joined(waiting))
+
+    def _joined(self, waiting: Mapping[str, list[bytes]]) -> Iterator[tuple[str, Any]]:
+        for topic, messages in waiting.items():
+            for _, alike in groupby(messages, len):
+                batch = list(alike)
+                with self._malformed_named():
+                    blocks = long_blocks(_BLOCKS[topic], batch)
+                    if blocks is not None:
+                        yield from ((topic, block) for block in blocks)
+                        continue
+                yield from ((topic, self._record(topic, raw)) for raw in batch)
+
+    def _record(self, topic: str, raw: bytes) -> Any:
+        with translated(self.path, _DAMAGED):
+            message = typestore().deserialize_cdr(raw, TOPIC_TYPES[topic])
+        with self._malformed_named():
+            return _TO_RECORD[topic](message)
+
+    @contextmanager
+    def _malformed_named(self) -> Iterator[None]:
+        try:
+            yield
+        except (DataError, CalibrationError) as err:
+            raise BagError(f"bag {str(self.path)!r} holds a malformed message: {err}") from err
 
     def _raw(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, bytes]]:
         """Serialised messages, as many as the bag promises."""
         promised = sum(connection.msgcount for connection in connections)
-        messages = self._reader.messages(connections) if connections else iter(())
-        while True:
-            with translated(self.path, _DAMAGED):
-                if (found := next(messages, None)) is None:
-                    break
-                connection, _, raw = found
-                raw = unpacked_message(raw) if self._compressed else raw
-            promised -= 1
-            yield connection, raw
+        with translated(self.path, _DAMAGED):
+            for connection, _, raw in self._reader.messages(connections) if connections else ():
+                promised -= 1
+                yield connection, unpacked_message(raw) if self._compressed else raw
         if promised:
             more_or_less = "fewer" if promised > 0 else "more"
             raise BagError(

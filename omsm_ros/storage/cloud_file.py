@@ -39,11 +39,12 @@ class PlyWriter:
         self._stream.write(self._header())
         return self
 
-    def write(self, points: SurfacePoints) -> None:
-        """Append points."""
-        packed = pack_points(points).astype(_PLY_DTYPE)
-        self._stream.write(packed.tobytes())
+    def write(self, points: SurfacePoints) -> NDArray[np.void]:
+        """Append points, and return them as :meth:`CloudFile.read` would (n,)."""
+        packed = pack_points(points, _PLY_DTYPE)
+        self._stream.write(packed.data)
         self.points += len(packed)
+        return packed
 
     def _header(self) -> bytes:
         lines = ["ply", "format binary_little_endian 1.0", f"comment {self._comment}"]

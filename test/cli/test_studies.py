@@ -157,6 +157,10 @@ def test_reversal_finds_no_latency_in_a_mechanical_lag(capsys, tmp_path, calibra
     assert abs(found["lag"]) < 4 * found["uncertainty"]
     assert found["uncertainty"] < 50e-6
     assert found["latency"] is False
+    assert found["points"] == sum(s["axes"]["corrected"] for s in found["samples"]) > 59_900
+    assert found["used"] == 60_000 - sum(2 + s["axes"]["received"] - s["axes"]["corrected"]
+                                         for s in found["samples"])  # fmt: skip
+    assert all(s["axes"]["received"] == 30_000 for s in found["samples"])
 
 
 def test_align_finds_the_spindle(capsys, tmp_path, calibration):
@@ -180,6 +184,10 @@ def test_align_finds_the_spindle(capsys, tmp_path, calibration):
     for name, true in (("centre_x", 30e-6), ("centre_y", -20e-6)):
         assert abs(found["geometry"][name] - true) < 4 * found["uncertainty"][name]
     assert found["uncertainty"]["centre_x"] < 1e-6
+    account = found["samples"]["axes"]
+    assert account["received"] == 25_000
+    assert account["corrected"] + account["counted"]["settling"] == 25_000
+    assert found["used"] == account["corrected"]
     # Across the feed, a sphere that runs true shows an offset in second order only.
     assert found["uncertainty"]["centre_y"] > 10e-6
     assert machine_files.load_geometry(out).centre_x == found["geometry"]["centre_x"]

@@ -9,14 +9,13 @@ the last bit, live and offline.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.correction.motion_filter import ABSURD, MotionFilter, MotionFilters
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER
@@ -268,25 +267,3 @@ def _run(block: Block, admission: Arrival, reasons: NDArray[np.uint8], values: F
     period_ns = block.sample_period * NANOSECONDS_PER_S
     whole = Run(admission.session, admission.first, block.stamp_ns, period_ns, reasons, values)
     return whole.part(admission.skip, len(whole)) if admission.skip else whole
-
-
-def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
-    """All points of ``parts`` in their order; None counts as no points."""
-    present = [part for part in parts if part is not None] or [_NO_POINTS]
-    return SurfacePoints(
-        **{
-            f.name: np.concatenate([getattr(p, f.name) for p in present])
-            for f in fields(_NO_POINTS)
-        }
-    )
-
-
-_NO_POINTS = SurfacePoints(
-    sample=np.empty(0, np.int64),
-    x=np.empty(0),
-    y=np.empty(0),
-    height=np.empty(0),
-    dynamic_error=np.empty(0),
-    uncertainty=np.empty(0),
-    intensity=np.empty(0, np.float32),
-)

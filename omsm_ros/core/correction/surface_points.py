@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,32 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.sample)
 
+    def part(self, place: slice) -> SurfacePoints:
+        """The points at ``place``."""
+        return SurfacePoints(**{f.name: getattr(self, f.name)[place] for f in fields(self)})
+
+
+def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
+    """All points of ``parts`` in their order; None counts as no points."""
+    present = [part for part in parts if part is not None] or [_NO_POINTS]
+    return SurfacePoints(
+        **{
+            f.name: np.concatenate([getattr(p, f.name) for p in present])
+            for f in fields(_NO_POINTS)
+        }
+    )
+
+
+_NO_POINTS = SurfacePoints(
+    sample=np.empty(0, np.int64),
+    x=np.empty(0),
+    y=np.empty(0),
+    height=np.empty(0),
+    dynamic_error=np.empty(0),
+    uncertainty=np.empty(0),
+    intensity=np.empty(0, np.float32),
+)
+
 
 CLOUD_FIELDS: tuple[tuple[str, str], ...] = (
     ("x", "<f4"),
@@ -58,9 +85,12 @@ POINT_DTYPE = np.dtype(
 """One point of a PointCloud2 message."""
 
 
-def pack_points(points: SurfacePoints) -> NDArray[np.void]:
-    """Points as a structured array (n,) of :data:`POINT_DTYPE`; z repeats height for viewers."""
-    packed = np.zeros(len(points), POINT_DTYPE)
+def pack_points(points: SurfacePoints, dtype: np.dtype[np.void] = POINT_DTYPE) -> NDArray[np.void]:
+    """Points as a structured array (n,) of ``dtype``, of the contract's fields.
+
+    z repeats height for viewers.
+    """
+    packed = np.zeros(len(points), dtype)
     packed["z"] = points.height
     # The counter of the trigger is 64 bits wide; a cloud keeps its low half.
     packed["sample"] = points.sample & 0xFFFFFFFF

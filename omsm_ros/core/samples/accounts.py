@@ -22,6 +22,7 @@ class Reason(IntEnum):
     DUPLICATE: the trigger count was seen before
     LATE: came after later samples, into a gap that had been passed
     SETTLING: the filter had just started
+    OVERDUE: waited for its partner, or for whom its partner waited, longer than is allowed
     """
 
     NONE = 0
@@ -30,6 +31,7 @@ class Reason(IntEnum):
     DUPLICATE = 3
     LATE = 4
     SETTLING = 5
+    OVERDUE = 6
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ are SI; arrays are float64 of shape (n,) unless said otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from types import MappingProxyType
@@ -148,47 +148,3 @@ class AccelerationBlock(Block):
 
     def __len__(self) -> int:
         return len(self.z)
-
-
-def join_axes(blocks: Sequence[AxisBlock]) -> AxisBlock:
-    """One block of blocks that follow each other (see :func:`follows`)."""
-    first = blocks[0]
-    x, y, z, b, c = (np.concatenate([getattr(k, name) for k in blocks]) for name in "xyzbc")
-    return AxisBlock(
-        stamp_ns=first.stamp_ns,
-        first_sample=first.first_sample,
-        sample_period=first.sample_period,
-        x=x,
-        y=y,
-        z=z,
-        b=b,
-        c=c,
-    )
-
-
-def join_distance(blocks: Sequence[DistanceBlock]) -> DistanceBlock:
-    """One block of blocks that follow each other (see :func:`follows`)."""
-    first = blocks[0]
-    return DistanceBlock(
-        stamp_ns=first.stamp_ns,
-        first_sample=first.first_sample,
-        sample_period=first.sample_period,
-        distance=np.concatenate([k.distance for k in blocks]),
-        intensity=np.concatenate([k.intensity for k in blocks]),
-        status=np.concatenate([k.status for k in blocks]),
-    )
-
-
-def follows(block: Block, before: Block) -> bool:
-    """True if ``block`` goes on where ``before`` ends, with the same channels."""
-    return (
-        block.first_sample == before.first_sample + len(before)
-        and block.sample_period == before.sample_period
-        and _optional_channels(block) == _optional_channels(before)
-    )
-
-
-def _optional_channels(block: Block) -> tuple[bool, bool]:
-    if not isinstance(block, DistanceBlock):
-        return (False, False)
-    return (bool(len(block.intensity)), bool(len(block.status)))

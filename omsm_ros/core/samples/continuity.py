@@ -1,8 +1,9 @@
 """Does a block continue its stream, or what happened in between?
 
-A device counts its triggers. The count tells gaps, repetitions and late arrivals; together
-with the time stamp it tells a device that has begun to count anew. Stamps may advance more
-slowly than the count times the sample period, when a recording is played in time lapse.
+A device counts its triggers; a count that wraps is continued by its driver and never seen
+here. The count tells gaps, repetitions and late arrivals; together with the time stamp it
+tells a device that has begun to count anew. Stamps may advance more slowly than the count
+times the sample period, when a recording is played in time lapse.
 """
 
 from __future__ import annotations
@@ -13,12 +14,8 @@ from dataclasses import dataclass
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Devices count triggers in 32 bits.
-COUNTER_SPAN = 2**32
 # Messages are not delivered this late; time that falls back further has been set back.
 TIME_JUMP_S = 2.0
-# A count that wrapped goes on close to zero; a larger leap is a device that was reset.
-_MAX_WRAP_GAP = 1_000_000
 _GAPS_REMEMBERED = 256
 
 
@@ -26,7 +23,7 @@ _GAPS_REMEMBERED = 256
 class Arrival:
     """What a block brings.
 
-    session: rises when the count begins anew;  first: unwrapped count of the block's first sample
+    session: rises when the count begins anew;  first: count of the block's first sample
     skip: leading samples to leave out, of which ``late`` fill a gap and the others were seen before
     """
 
@@ -41,7 +38,6 @@ class TriggerCount:
 
     def __init__(self) -> None:
         self._session = -1
-        self._offset = 0
         self._next = 0
         self._newest_first = 0
         self._newest_stamp_ns: int | None = None
@@ -49,11 +45,9 @@ class TriggerCount:
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
-        first = self._unwrapped(block.first_sample)
+        first = block.first_sample
         if self._begins_anew(first, block):
             self._session += 1
-            self._offset = 0
-            first = block.first_sample
             self._next = first
             self._gaps.clear()
         elif first > self._next:
@@ -69,17 +63,6 @@ class TriggerCount:
     def end(self) -> None:
         """Whatever comes next begins a session."""
         self._newest_stamp_ns = None
-
-    def _unwrapped(self, count: int) -> int:
-        count += self._offset
-        beyond = count + COUNTER_SPAN
-        if 0 <= beyond - self._next <= _MAX_WRAP_GAP and self._newest_stamp_ns is not None:
-            self._offset += COUNTER_SPAN
-            return beyond
-        if self._offset and count - self._next > COUNTER_SPAN // 2:
-            # A late block from before the wrap.
-            return count - COUNTER_SPAN
-        return count
 
     def _begins_anew(self, first: int, block: Block) -> bool:
         if self._newest_stamp_ns is None:

@@ -10,7 +10,7 @@ are axis blocks as the probe's own trigger would have latched them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, TypeVar
 
@@ -161,12 +161,12 @@ def _at(
 
 
 def _sessions(blocks: Iterable[B]) -> list[list[B]]:
-    """Blocks by session, their counts unwrapped, without those that overlap or come late."""
+    """Blocks by session, without those that overlap or come late."""
     count, placed = TriggerCount(), []
     for block in blocks:
         admission = count.place(block, len(block))
         if admission.skip == 0:
-            placed.append((admission.session, replace(block, first_sample=admission.first)))
+            placed.append((admission.session, block))
     return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
 
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.samples.accounts import Reason, Tally
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.continuity import COUNTER_SPAN
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
@@ -68,10 +67,14 @@ class Run:
 
 
 class Queue:
-    """Runs of one stream that wait for a partner."""
+    """Runs of one stream that wait for a partner.
+
+    given_up: the newest samples that waited too long
+    """
 
     def __init__(self, tally: Tally) -> None:
         self.pending = 0
+        self.given_up: Run | None = None
         self._runs: deque[Run] = deque()
         self._tally = tally
 
@@ -85,10 +88,11 @@ class Queue:
         self._runs.append(run)
         self.pending += len(run)
 
-    def drop(self, samples: int) -> None:
-        """The oldest ``samples`` of the head have no partner."""
-        reasons = self._cut(samples).reasons
-        self._tally.count_each(np.where(reasons, reasons, np.uint8(Reason.UNMATCHED)))
+    def drop(self, samples: int, reason: Reason = Reason.UNMATCHED) -> Run:
+        """Take the oldest ``samples`` of the head, which have no partner for ``reason``."""
+        run = self._cut(samples)
+        self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
+        return run
 
     def pair(self, samples: int, partner_reasons: NDArray[np.uint8]) -> Run:
         """Take the oldest ``samples`` of the head, whose partners have these reasons."""
@@ -100,9 +104,10 @@ class Queue:
         return run
 
     def limit(self, samples: int) -> None:
-        """Drop the oldest until no more than ``samples`` wait."""
+        """Give the oldest up until no more than ``samples`` wait."""
         while self.pending > samples:
-            self.drop(min(self.pending - samples, len(self._runs[0])))
+            excess = min(self.pending - samples, len(self._runs[0]))
+            self.given_up = self.drop(excess, Reason.OVERDUE)
 
     def clear(self) -> None:
         """Nothing that waits will find a partner."""
@@ -120,11 +125,10 @@ class Queue:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Session of the axes, session of the distance, and what to add to the distance's count."""
+    """A session of the axes, and the session of the distance that counts the same triggers."""
 
     axes: int
     distance: int
-    shift: int
 
 
 class Pairing:
@@ -133,16 +137,18 @@ class Pairing:
     def __init__(self, axes: Tally, distance: Tally) -> None:
         self.axes = Queue(axes)
         self.distance = Queue(distance)
-        self._link = _Link(-1, -1, 0)
+        self._link = _Link(-1, -1)
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
         """Runs of axes and distance of equal count and length, as far as they are complete."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
             if order < 0:
-                self.axes.drop(self._leading(a, d.first + self._link.shift, a.session, d))
+                samples = self._leading(a, d.first, a, d)
+                self.axes.drop(samples, _missing(a, self.distance))
             elif order > 0:
-                self.distance.drop(self._leading(d, a.first - self._link.shift, a.session, d))
+                samples = self._leading(d, a.first, a, d)
+                self.distance.drop(samples, _missing(d, self.axes))
             else:
                 samples = min(len(a), len(d))
                 yield (
@@ -150,22 +156,23 @@ class Pairing:
                     self.distance.pair(samples, a.reasons[:samples]),
                 )
 
-    def _leading(self, run: Run, other_first: int, axes_session: int, d: Run) -> int:
+    def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
         """Samples of ``run`` before the other head, all of them if the sessions differ."""
-        if (axes_session, d.session) != (self._link.axes, self._link.distance):
+        if not self._linked(a, d):
             return len(run)
         return min(other_first - run.first, len(run))
 
+    def _linked(self, a: Run, d: Run) -> bool:
+        return (a.session, d.session) == (self._link.axes, self._link.distance)
+
     def _order(self, a: Run, d: Run) -> int:
         """-1: the axes' head has no partner; 1: the distance's; 0: both begin with a pair."""
-        if (a.session, d.session) != (self._link.axes, self._link.distance):
-            shift = round((a.first - d.first) / COUNTER_SPAN) * COUNTER_SPAN
-            if _apart(a, d, shift):
+        if not self._linked(a, d):
+            if _apart(a, d):
                 return self._older(a, d)
-            if _overlap(a, d, shift):
-                self._link = _Link(a.session, d.session, shift)
-            return _sign(a.first - (d.first + shift))
-        return _sign(a.first - (d.first + self._link.shift))
+            if max(a.first, d.first) < min(a.end, d.end):
+                self._link = _Link(a.session, d.session)
+        return _sign(a.first - d.first)
 
     def _older(self, a: Run, d: Run) -> int:
         """Which of two heads that cannot be of one session is left over from before."""
@@ -176,15 +183,17 @@ class Pairing:
         return _sign(a.stamp_ns - d.stamp_ns) or -1
 
 
-def _apart(a: Run, d: Run, shift: int) -> bool:
+def _apart(a: Run, d: Run) -> bool:
     """True if one trigger count would have had two different times."""
-    count = max(a.first, d.first + shift)
-    lead_ns = a.stamp_of(count) - d.stamp_of(count - shift)
-    return abs(lead_ns) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
+    count = max(a.first, d.first)
+    return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
 
 
-def _overlap(a: Run, d: Run, shift: int) -> bool:
-    return max(a.first, d.first + shift) < min(a.end, d.end + shift)
+def _missing(run: Run, other: Queue) -> Reason:
+    """Why the other stream has no partner for the first sample of ``run``: did it give it up?"""
+    lost = other.given_up
+    overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
+    return Reason.OVERDUE if overdue else Reason.UNMATCHED
 
 
 def _sign(value: float) -> int:

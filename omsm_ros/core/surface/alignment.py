@@ -18,9 +18,11 @@ from scipy import optimize
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
+from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.errors import DataError
 from omsm_ros.units import MICROMETRE_M
 
+_COLUMNS = ("x", "y", "z", "b", "c", "distance")
 _MIN_POINTS = 1000
 _MAX_POINTS = 60_000
 _GROUP_POINTS = 100
@@ -52,6 +54,7 @@ class Alignment:
     uncertainty: standard uncertainties of centre_x, centre_y [m], beam_x, beam_y [1]
     sphere: centre in the workpiece frame and radius [m]; convex if its centre lies below
     residual: rms left [m];  beam_found: False where the distance hardly varied
+    used: points fitted
     """
 
     geometry: Geometry
@@ -59,6 +62,38 @@ class Alignment:
     sphere: tuple[float, float, float, float]
     residual: float
     beam_found: bool
+    used: int
+
+
+class SphereScanReader:
+    """The scan behind corrected points that come in portions, in bounded memory.
+
+    points: how many came; of them no more than are fitted are kept, evenly chosen
+    """
+
+    def __init__(self) -> None:
+        self.points = 0
+        self._axes: list[AxisBlock] = []
+        self._kept = EvenSelection(_MAX_POINTS)
+
+    def add_axes(self, block: AxisBlock) -> None:
+        """Take in the next axis block, before the points that come of it."""
+        self._axes.append(block)
+
+    def add(self, points: SurfacePoints) -> None:
+        """Take in the next points, corrected with no geometry and no sideways lag."""
+        if not len(points):
+            return
+        scan = sphere_scan_of(points, self._axes)
+        self._kept.add(np.stack([getattr(scan, name) for name in _COLUMNS], axis=1))
+        self.points += len(points)
+        last = points.sample[-1]
+        self._axes = [b for b in self._axes if b.first_sample + len(b) > last]
+
+    def scan(self) -> SphereScan:
+        """The points kept."""
+        rows = self._kept.rows().reshape(-1, len(_COLUMNS))
+        return SphereScan(**dict(zip(_COLUMNS, rows.T, strict=True)))
 
 
 def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
@@ -118,6 +153,7 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
         sphere=(sphere[0], sphere[1], sphere[2], radius),
         residual=residual,
         beam_found=beam,
+        used=len(scan.z),
     )
 
 
@@ -205,12 +241,11 @@ def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> Float
 
 def _thinned(scan: SphereScan) -> SphereScan:
     samples = len(scan.z)
-    names: Sequence[str] = ("x", "y", "z", "b", "c", "distance")
-    good = np.all([np.isfinite(getattr(scan, name)) for name in names], axis=0)
+    good = np.all([np.isfinite(getattr(scan, name)) for name in _COLUMNS], axis=0)
     if np.count_nonzero(good) < _MIN_POINTS:
         raise DataError(
             f"scan of {int(np.count_nonzero(good))} finite points of {samples}, "
             f"expected {_MIN_POINTS} or more"
         )
     used = np.flatnonzero(good)[:: -(-samples // _MAX_POINTS)]
-    return SphereScan(**{name: getattr(scan, name)[used] for name in names})
+    return SphereScan(**{name: getattr(scan, name)[used] for name in _COLUMNS})

@@ -23,10 +23,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import linalg
 
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.errors import DataError
 
 DEFAULT_DEGREE = 8
@@ -35,8 +36,8 @@ _CONVERGED_S = 1e-9
 # Residuals are taken as correlated along the path within groups of so many points.
 _GROUP_POINTS = 200
 _MIN_POINTS = 20 * _GROUP_POINTS
-# More would not fit into memory comfortably; the others are left out evenly.
-_MAX_POINTS = 150_000
+# Of one scan: with 45 terms of the surface and their slopes a hundred megabytes.
+_MAX_POINTS = 75_000
 # A surface whose azimuthal slope gives less than this is no test of a lag.
 _MAX_UNCERTAINTY_S = 0.1
 
@@ -46,7 +47,7 @@ class SidewaysLag:
     """How late the probe's reading is against X and C.
 
     lag, uncertainty: [s], k = 1;  lag_of_z: of the calibration at low frequency [s]
-    residual: rms that lag and surface leave [m]
+    residual: rms that lag and surface leave [m];  points, used: of all scans, and fitted
     latency: True if the lag of Z is latency, False if mechanical, None if neither within 3 u
     """
 
@@ -54,21 +55,73 @@ class SidewaysLag:
     uncertainty: float
     lag_of_z: float
     residual: float
+    points: int
+    used: int
     latency: bool | None
 
 
+class ScanPath:
+    """A scan that comes in portions, in bounded memory: where its points lie, and their velocity.
+
+    points: how many came;  used: how many, evenly chosen, are kept to be fitted
+    """
+
+    def __init__(self, sample_period: float) -> None:
+        self._period = sample_period
+        self._last: SurfacePoints | None = None
+        self._kept = EvenSelection(_MAX_POINTS)
+        self.points = 0
+
+    @classmethod
+    def of(cls, points: SurfacePoints, sample_period: float) -> ScanPath:
+        """The path of a whole scan, sampled every ``sample_period`` [s]."""
+        path = cls(sample_period)
+        path.add(points)
+        return path
+
+    @property
+    def used(self) -> int:
+        """Points that are kept."""
+        return len(self._kept)
+
+    def add(self, points: SurfacePoints) -> None:
+        """Take in the next points, corrected with lateral_lag=0."""
+        self.points += len(points)
+        points = join_points([self._last, points])
+        self._last = points.part(slice(max(len(points) - 2, 0), None))
+        if len(points) < 3:
+            return
+        position = points.x + 1j * points.y
+        apart = points.sample[2:] - points.sample[:-2]
+        # Where a point is missing the velocity is not that of the point between.
+        whole = apart == 2
+        velocity = (position[2:] - position[:-2])[whole] / (2 * self._period)
+        kept = np.stack([position[1:-1][whole], velocity, points.height[1:-1][whole]], axis=1)
+        self._kept.add(kept)
+
+    def columns(self) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """Position and velocity [m], [m/s] as x + jy, and height [m], each (used,).
+
+        Raises DataError for a scan that is too short.
+        """
+        rows = self._kept.rows()
+        if len(rows) < _MIN_POINTS:
+            raise DataError(f"scan of {self.points} points, expected {_MIN_POINTS} or more")
+        return rows[:, 0], rows[:, 1], rows[:, 2].real
+
+
 def sideways_lag(
-    scans: Sequence[SurfacePoints], calibration: Calibration, degree: int = DEFAULT_DEGREE
+    scans: Sequence[ScanPath], calibration: Calibration, degree: int = DEFAULT_DEGREE
 ) -> SidewaysLag:
     """Lag of the probe against X and C from scans with opposite spindle directions.
 
-    scans: corrected with ``calibration`` and lateral_lag=0, two or more, of one surface
+    scans: corrected with ``calibration``, two or more, of one surface
     degree: of the surface in x and y; more for a rougher surface
 
     Raises DataError if the scans turn the same way, are too short, or the surface has no
     slope along the path.
     """
-    path = _Path.of(scans, calibration.sample_period)
+    path = _Path.of(scans)
     lag, jacobian, residual = 0.0, np.empty((0, 0)), np.empty(0)
     for _ in range(_ITERATIONS):
         surface, slopes = path.design(lag, degree)
@@ -90,6 +143,8 @@ def sideways_lag(
         uncertainty=uncertainty,
         lag_of_z=of_z,
         residual=float(np.sqrt(np.mean(residual**2))),
+        points=sum(scan.points for scan in scans),
+        used=sum(scan.used for scan in scans),
         latency=_verdict(lag, uncertainty, of_z),
     )
 
@@ -111,11 +166,10 @@ class _Path:
     pistons: FloatArray
 
     @classmethod
-    def of(cls, scans: Sequence[SurfacePoints], period: float) -> _Path:
+    def of(cls, scans: Sequence[ScanPath]) -> _Path:
         if len(scans) < 2:
             raise DataError(f"{len(scans)} scan, expected one in each spindle direction")
-        every = -(-sum(map(len, scans)) // _MAX_POINTS)
-        parts = [_moving(points, period, every) for points in scans]
+        parts = [scan.columns() for scan in scans]
         turns = [float(np.sum(np.imag(np.conj(p) * v))) for p, v, _ in parts]
         if not min(turns) < 0 < max(turns):
             raise DataError("both scans turn the same way; reverse the spindle for one of them")
@@ -138,19 +192,6 @@ class _Path:
         along_x = dx[:, ex] * ty[:, ey] / 1.05
         along_y = tx[:, ex] * dy[:, ey] / 1.05
         return tx[:, ex] * ty[:, ey], (along_x, along_y)
-
-
-def _moving(
-    points: SurfacePoints, period: float, every: int
-) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Position, velocity and height of every so many points, where they are consecutive."""
-    if len(points) < _MIN_POINTS:
-        raise DataError(f"scan of {len(points)} points, expected {_MIN_POINTS} or more")
-    position = points.x + 1j * points.y
-    apart = points.sample[2:] - points.sample[:-2]
-    velocity = (position[2:] - position[:-2]) / (apart * period)
-    used = np.flatnonzero(apart == 2)[::every]
-    return position[1:-1][used], velocity[used], points.height[1:-1][used]
 
 
 def _derivative_vander(vander: FloatArray, degree: int) -> FloatArray:

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points, lateral_lag
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, lateral_lag
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
@@ -311,15 +311,14 @@ def test_a_count_that_begins_anew_is_a_new_scan(scan: Recording, seconds: float)
     assert twice.axes.counted == {"settling": 2 * account.axes.counted["settling"]}
 
 
-def test_a_count_that_wraps_is_no_interruption(scan: Recording) -> None:
+def test_counts_beyond_32_bits_are_no_interruption(scan: Recording) -> None:
     axes, distance = part(scan.axes, 0, 2000), part(scan.distance, 0, 2000)
     plain, _ = run([axes], [distance])
     start = 2**32 - 700
-    blocks = [
-        [replace(b, first_sample=(b.first_sample + start) % 2**32) for b in cut(whole, sizes)]
-        for whole, sizes in ((axes, range(100, 2000, 100)), (distance, range(70, 2000, 70)))
-    ]
-    points, account = run(*blocks)
+    points, account = run(
+        [replace(b, first_sample=b.first_sample + start) for b in cut(axes, range(100, 2000, 100))],
+        [replace(b, first_sample=b.first_sample + start) for b in cut(distance, [70, 1400])],
+    )
     assert np.array_equal(points.height, plain.height)
     assert np.array_equal(points.sample, plain.sample + start)
     assert set(account.axes.counted) == {"settling"}
@@ -341,8 +340,11 @@ def test_what_waits_in_vain_is_bounded(scan: Recording) -> None:
         corrector.push_axes(block)  # type: ignore[arg-type]
         assert corrector.account.axes.pending <= 1000
         assert balanced(corrector.account.axes)
-    unmatched = 3000 - corrector.account.axes.counted["settling"]
-    assert corrector.account.axes.counted["unmatched"] == unmatched
+    overdue = 3000 - corrector.account.axes.counted["settling"]
+    assert corrector.account.axes.counted["overdue"] == overdue
+    corrector.push_distance(part(scan.distance, 0, 4000))  # type: ignore[arg-type]
+    assert corrector.account.distance.counted["overdue"] == 3000
+    assert corrector.account.distance.corrected == 1000
 
 
 def test_stamps_that_disagree_about_a_trigger_are_told(scan: Recording) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
     contributions,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from omsm_ros.core.correction.correct import Corrector, join_points
+from omsm_ros.core.correction.correct import Corrector
+from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.trajectories import Spiral

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
@@ -138,13 +139,6 @@ def test_repeated_blocks_bring_nothing_new() -> None:
     once = joined(axes_at_probe(axes, probe_blocks()))[1]["z"]
     twice = joined(axes_at_probe([b for a in axes for b in (a, a)], probe_blocks()))[1]["z"]
     assert np.array_equal(once, twice)
-
-
-def test_a_count_that_wraps_keeps_its_time() -> None:
-    axes = axis_blocks()
-    wrapped = [replace(b, first_sample=(b.first_sample + 2**32 - 4000) % 2**32) for b in axes]
-    plain = joined(axes_at_probe(axes, probe_blocks()))[1]["z"]
-    assert np.array_equal(joined(axes_at_probe(wrapped, probe_blocks()))[1]["z"], plain)
 
 
 def test_too_few_axis_samples_are_refused() -> None:

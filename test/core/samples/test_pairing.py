@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omsm_ros.core.samples.accounts import Reason, Tally
-from omsm_ros.core.samples.continuity import COUNTER_SPAN
 from omsm_ros.core.samples.pairing import Pairing, Run
 
 
@@ -122,16 +121,22 @@ def test_a_false_start_of_one_stream_does_not_cost_the_scan() -> None:
     assert [pair for pair in bench.found if pair[1] == 1] == [(0, 1, k) for k in range(50, 500)]
 
 
-def test_streams_that_joined_on_either_side_of_a_wrap_meet() -> None:
-    bench = Bench().push([run(0, COUNTER_SPAN + 10, 20, 5.0)], [run(0, 10, 20, 5.0)])
-    assert len(bench.found) == 20
-
-
-def test_a_bounded_queue_drops_the_oldest() -> None:
+def test_a_bounded_queue_gives_the_oldest_up_and_tells_it_from_what_has_no_partner() -> None:
     bench = Bench().push([run(0, 0, 60), run(0, 60, 60)], [])
     bench.pairing.axes.limit(100)
-    assert bench.axes.snapshot(0).counted == {"unmatched": 20}
+    assert bench.axes.snapshot(0).counted == {"overdue": 20}
     assert bench.push([], [run(0, 0, 60)]).counts() == list(range(20, 60))
+    assert bench.distance.snapshot(0).counted == {"overdue": 20}
+    assert bench.push([], [run(0, 70, 50)]).counts() == [*range(20, 60), *range(70, 120)]
+    assert bench.axes.snapshot(0).counted == {"overdue": 20, "unmatched": 10}
+
+
+def test_what_was_given_up_in_an_old_session_excuses_nothing_in_a_new_one() -> None:
+    bench = Bench().push([run(0, 0, 100, 0.0)], [])
+    bench.pairing.axes.limit(0)
+    bench.push([run(1, 50, 50, 20.05)], [run(0, 0, 100, 20.0)])
+    assert bench.counts() == list(range(50, 100))
+    assert bench.distance.snapshot(0).counted == {"unmatched": 50}
 
 
 def pieces(draw_cuts: list[int], runs: list[Run]) -> list[Run]:

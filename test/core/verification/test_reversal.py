@@ -7,19 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
-from omsm_ros.core.verification.reversal import sideways_lag
+from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 LATENCY = 0.34e-3
+PERIOD = 1e-3
 PROMPT = TransferFunction(np.ones(1), np.array([1.0, 1 / (2 * np.pi * 5000)]))
 
 
@@ -48,24 +49,24 @@ def scan(
     surface: Surface = PAPER_MIRROR,
     lateral_lag: float = 0.0,
     feed: float = 2e-3,
-) -> SurfacePoints:
+) -> ScanPath:
     spiral = Spiral(surface, start_radius=12.7e-3, feed_per_turn=feed, spindle_speed=speed)
     recording = record(replace(cell, seed=seed), spiral, surface)
     corrector = Corrector(known, CorrectionOptions(lateral_lag=lateral_lag))
     corrector.push_axes(recording.axes)
     corrector.push_distance(recording.distance)
-    return join_points([corrector.finish()])
+    return ScanPath.of(join_points([corrector.finish()]), PERIOD)
 
 
 LATE_CELL = Cell(plant=Plant(dynamics=PROMPT), latency=LATENCY)
 
 
 @pytest.fixture(scope="module")
-def late_scans() -> list[SurfacePoints]:
+def late_scans() -> list[ScanPath]:
     return [scan(30.0, 1, LATE, LATE_CELL), scan(-30.0, 2, LATE, LATE_CELL)]
 
 
-def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[SurfacePoints]) -> None:
+def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanPath]) -> None:
     found = sideways_lag(late_scans, LATE)
     assert found.uncertainty < 1e-6
     assert abs(found.lag - LATENCY) < 3 * found.uncertainty
@@ -80,7 +81,7 @@ def test_a_mechanical_lag_is_not_sideways() -> None:
     assert found.lag_of_z == pytest.approx(0.3397e-3, abs=1e-7)
 
 
-def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[SurfacePoints]) -> None:
+def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[ScanPath]) -> None:
     total = LATE.dynamics.low_frequency_delay
     known = replace(LATE, covariance=calibration(LATE.dynamics, (20e-6) ** 2).covariance)
     found = sideways_lag(late_scans, known)
@@ -89,7 +90,7 @@ def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[SurfacePoint
 
 
 def test_a_poorly_known_delay_of_the_calibration_limits_the_estimate(
-    late_scans: list[SurfacePoints],
+    late_scans: list[ScanPath],
 ) -> None:
     vague = replace(LATE, covariance=calibration(LATE.dynamics, (50e-6) ** 2).covariance)
     assert sideways_lag(late_scans, vague).uncertainty == pytest.approx(50e-6, rel=1e-3)
@@ -115,18 +116,18 @@ def test_the_stated_uncertainty_is_that_of_repetition() -> None:
     assert 0.5 < np.std(errors) / stated < 1.7
 
 
-def test_scans_in_one_direction_are_refused(late_scans: list[SurfacePoints]) -> None:
+def test_scans_in_one_direction_are_refused(late_scans: list[ScanPath]) -> None:
     with pytest.raises(DataError, match="turn the same way"):
         sideways_lag([late_scans[0], late_scans[0]], LATE)
 
 
-def test_a_single_scan_is_refused(late_scans: list[SurfacePoints]) -> None:
+def test_a_single_scan_is_refused(late_scans: list[ScanPath]) -> None:
     with pytest.raises(DataError, match="1 scan"):
         sideways_lag(late_scans[:1], LATE)
 
 
-def test_a_short_scan_is_refused(late_scans: list[SurfacePoints]) -> None:
-    few = join_points([])
+def test_a_short_scan_is_refused(late_scans: list[ScanPath]) -> None:
+    few = ScanPath(PERIOD)
     with pytest.raises(DataError, match="scan of 0 points"):
         sideways_lag([late_scans[0], few], LATE)
 

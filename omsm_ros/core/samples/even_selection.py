@@ -1,0 +1,41 @@
+"""Which samples of a stream of unknown length stand for all of it, in bounded memory?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class EvenSelection:
+    """Keeps every k-th row, k the least power of two with which no more than ``most`` are kept.
+
+    What is kept does not depend on how the stream was cut.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._every = 1
+        self._seen = 0
+        self._parts: list[NDArray[Any]] = []
+
+    def __len__(self) -> int:
+        """Rows kept."""
+        return -(-self._seen // self._every)
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Take in the next ``rows`` (n, …)."""
+        part = rows[-self._seen % self._every :: self._every]
+        self._seen += len(rows)
+        if len(part):
+            self._parts.append(part.copy())
+        while len(self) > self._most:
+            self._parts = [self.rows()[::2].copy()]
+            self._every *= 2
+
+    def rows(self) -> NDArray[Any]:
+        """All rows kept so far, in order; empty before the first."""
+        if len(self._parts) != 1:
+            self._parts = [np.concatenate(self._parts)] if self._parts else [np.empty(0)]
+        return self._parts[0]
