@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
@@ -92,9 +92,7 @@ class CorrectedScan:
                 polarity=self._options.polarity,
             )
             self.admitted = admit(self._calibration, self.reasons, self._admission.override)
-            # Files are read as fast as they come: what bounds a wait is memory, not time.
-            options = replace(self._options, max_pending=MOST_WAITING * self.sample_period)
-            self._corrector = Corrector(self._calibration, options)
+            self._corrector = Corrector(self._calibration, self._options, MOST_WAITING)
             self._stack = opening.pop_all()
         return self
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 
 import numpy as np
@@ -81,11 +82,11 @@ def test_what_continues_is_one_block_of_the_same_values(
 
 @pytest.mark.parametrize(
     "second",
-    [axes(101, 100), axes(100, 100, stamp=-1), axes(100, 100, period=2e-3), axes(0, 100)],
+    [axes(101, 100), axes(100, 100, stamp=0), axes(100, 100, period=2e-3), axes(0, 100)],
     ids=["gap", "time set back", "another period", "restart"],
 )
 def test_what_does_not_continue_begins_a_block(second: AxisBlock) -> None:
-    first = axes(0, 100)
+    first = axes(0, 100, stamp=1000)
     found = long_blocks(AxisBlock, [serialised(first), serialised(second)])
     assert found is not None
     for block, made in zip(found, (first, second), strict=True):
@@ -108,8 +109,10 @@ def test_a_message_cut_short_or_forged_is_left_to_be_taken_apart(cut: int) -> No
     forged = bytearray(whole)
     forged[cut : cut + 4] = b"\xff\xff\xff\xff"
     found = long_blocks(AxisBlock, [bytes(forged)])
-    # Either the layout does not fit any more, or one value of it is another one.
-    assert found is None or len(next(iter(found)).z) == 3
+    # Either the layout does not fit any more, or one value of it is another one: which one
+    # the block's own class judges.
+    with suppress(DataError):
+        assert found is None or len(next(iter(found)).z) == 3
 
 
 def test_big_endian_is_left_to_be_taken_apart() -> None:

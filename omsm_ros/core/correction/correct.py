@@ -70,13 +70,19 @@ class Corrector:
 
     Push the two streams about as they came: what waits longer than ``max_pending`` for its
     partner is given up, so that memory stays bounded. Each may also come as one block.
+
+    most_waiting: samples that may wait, for files, which know no time; None = ``max_pending``
     """
 
     def __init__(
-        self, calibration: Calibration, options: CorrectionOptions = CorrectionOptions()
+        self,
+        calibration: Calibration,
+        options: CorrectionOptions = CorrectionOptions(),
+        most_waiting: int | None = None,
     ) -> None:
         self._calibration = calibration
         self._options = options
+        self._most_waiting = most_waiting
         self._static_gain = options.static_gain or calibration.static_gain
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
@@ -115,7 +121,8 @@ class Corrector:
             self._pairing.distance.limit(self._most_pending(block))
 
     def _most_pending(self, newest: AxisBlock | DistanceBlock) -> int:
-        return max(int(self._options.max_pending / newest.sample_period), len(newest))
+        live = int(self._options.max_pending / newest.sample_period)
+        return max(live if self._most_waiting is None else self._most_waiting, len(newest))
 
     def take(self) -> SurfacePoints | None:
         """Points completed since the last call, None if there are none."""
