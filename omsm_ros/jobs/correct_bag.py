@@ -96,18 +96,7 @@ def correct_bag(
                     if nominal is not None and lateral:
                         points = with_lateral(points, nominal, lateral)
                     found.add(points, ply.write(points))
-        return Correction(
-            account=scan.account.as_dict(),
-            budget=scan.budget,
-            stamp_skew=scan.stamp_skew,
-            admission=scan.admitted,
-            reasons=scan.reasons,
-            statistics=found.statistics(),
-            largest_uncertainty=found.largest,
-            points=found.drawn.rows(),
-            motion=found.motion.first(),
-            sample_period=scan.sample_period,
-        )
+        return _correction(scan, found)
 
 
 class _Start:
@@ -153,3 +142,18 @@ class _Findings:
         if not len(self.drawn):
             return {}
         return {name: running.statistics() for name, running in self._running.items()}
+
+
+def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
+    return Correction(
+        account=scan.account.as_dict(),
+        budget=scan.budget,
+        stamp_skew=scan.stamp_skew,
+        admission=scan.admitted,
+        reasons=scan.reasons,
+        statistics=found.statistics(),
+        largest_uncertainty=found.largest,
+        points=found.drawn.rows(),
+        motion=found.motion.first(),
+        sample_period=scan.sample_period,
+    )
