@@ -5,16 +5,28 @@ Small is a good machine on a good day, large one that its owner still thinks is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
+from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.channels import ReferenceSensor
+from omsm_ros.twin.clocks import ClockErrors
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose
+from omsm_ros.twin.encoder import EncoderErrors, Pitch
+from omsm_ros.twin.machine_errors import (
+    Drift,
+    Harmonic,
+    MachineErrors,
+    SpindleError,
+    Straightness,
+)
+from omsm_ros.twin.part_pose import PartPose
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.structure import Creep, Friction, LogCreep, SoftMode, StructureErrors
 from omsm_ros.twin.vibration import VibrationLine
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 Sizes = tuple[Disturbances, Disturbances, Disturbances]
 Record = TypeVar("Record")
@@ -22,90 +34,104 @@ Record = TypeVar("Record")
 SIZES = ("small", "medium", "large")
 
 
-def _probe(*sizes: ProbeErrors) -> Sizes:
-    small, medium, large = (Disturbances(probe=size) for size in sizes)
+_THREE_WAVES = (5e-9, 10e-9, 20e-9)
+
+
+def _each(family: str, record: Callable[..., Any], name: str, *sizes: Any, **fixed: Any) -> Sizes:
+    """One ``name`` of the ``family``'s record in three sizes."""
+    small, medium, large = (
+        Disturbances(**{family: record(**{name: size}, **fixed)}) for size in sizes
+    )
     return small, medium, large
 
 
-def _structure(*sizes: StructureErrors) -> Sizes:
-    small, medium, large = (Disturbances(structure=size) for size in sizes)
-    return small, medium, large
-
-
-def _machine(*sizes: MachineErrors) -> Sizes:
-    small, medium, large = (Disturbances(machine=size) for size in sizes)
-    return small, medium, large
+_probe = partial(_each, "probe", ProbeErrors)
+_structure = partial(_each, "structure", StructureErrors)
+_machine = partial(_each, "machine", MachineErrors)
+_encoder = partial(_each, "encoder", EncoderErrors)
+_clocks = partial(_each, "clocks", ClockErrors)
 
 
 def _line(**fixed: float) -> Sizes:
     small, medium, large = (
-        Disturbances(vibration=(VibrationLine(amplitude_m=size, **fixed),))
-        for size in (5 * NANOMETRE_M, 10 * NANOMETRE_M, 20 * NANOMETRE_M)
+        Disturbances(vibration=(VibrationLine(amplitude_m=size, **fixed),)) for size in _THREE_WAVES
     )
     return small, medium, large
 
 
 def _creep(time_constant_s: float) -> Sizes:
     return _structure(
-        *(
-            StructureErrors(creep=(Creep(fraction=f, time_constant_s=time_constant_s),))
-            for f in (1e-4, 3e-4, 1e-3)
-        )
+        "creep",
+        *((Creep(fraction=f, time_constant_s=time_constant_s),) for f in (1e-4, 3e-4, 1e-3)),
     )
 
 
 def _soft_mode(frequency_hz: float, damping_ratio: float) -> Sizes:
-    return _structure(
-        *(
-            StructureErrors(
-                soft_modes=(
-                    SoftMode(
-                        frequency_hz=frequency_hz, damping_ratio=damping_ratio, participation=p
-                    ),
-                )
-            )
-            for p in (1e-4, 3e-4, 1e-3)
-        )
-    )
+    mode = partial(SoftMode, frequency_hz=frequency_hz, damping_ratio=damping_ratio)
+    return _structure("soft_modes", *((mode(participation=p),) for p in (1e-4, 3e-4, 1e-3)))
 
 
 def _drift(name: str, *sizes: float, **fixed: float) -> Sizes:
-    return _machine(*(MachineErrors(drift=Drift(**{name: size, **fixed})) for size in sizes))
+    return _machine("drift", *(Drift(**{name: size}, **fixed) for size in sizes))
+
+
+def _spindle(name: str, *sizes: float, per_turn: int) -> Sizes:
+    return _machine(
+        "spindle",
+        *(SpindleError(**{name: (Harmonic(amplitude=s, per_turn=per_turn),)}) for s in sizes),
+    )
 
 
 CATALOGUE: dict[str, Sizes] = {
-    "latency": _probe(*(ProbeErrors(latency_s=s) for s in (0.05e-3, 0.17e-3, 0.34e-3))),
-    "exposure": _probe(*(ProbeErrors(exposure_s=s) for s in (0.1e-3, 0.3e-3, 0.9e-3))),
-    "averaging": _probe(*(ProbeErrors(exposure_s=0.2e-3, averages=n) for n in (2, 4, 8))),
+    "slow servo": tuple(Disturbances(servo_bandwidth_hz=f) for f in (100.0, 70.0, 50.0)),
+    "latency": _probe("latency_s", 0.05e-3, 0.17e-3, 0.34e-3),
+    "exposure": _probe("exposure_s", 0.1e-3, 0.3e-3, 0.9e-3),
+    "averaging": _probe("averages", 2, 4, 8, exposure_s=0.2e-3),
+    "noise of the probe": _probe("noise_m", 10e-9, 20e-9, 40e-9),
+    "linearity, cubic": _probe("cubic_m", 5e-9, 15e-9, 50e-9),
+    "linearity, periodic": _probe("periodic_m", *_THREE_WAVES, period_m=7e-6),
+    "linearity, periodic as the steps": _probe("periodic_m", *_THREE_WAVES, period_m=9.8e-6),
+    "slope error": _probe("slope_error_m_per_rad", 0.05e-6, 0.15e-6, 0.5e-6),
+    "slope error, square": _probe("slope_error_m_per_rad2", 0.5e-6, 1.5e-6, 5e-6),
+    "light lost on slopes": _probe("intensity_slope_rad", 0.5, 0.3, 0.15),
+    "dropouts": _probe("dropout_probability", 1e-3, 1e-2, 5e-2),
+    "dropouts on slopes": _probe("dropout_slope_rad", 0.2, 0.15, 0.1),
     "creep, 0.2 s": _creep(0.2),
     "creep, 2 s": _creep(2.0),
     "creep, 20 s": _creep(20.0),
     "logarithmic creep": _structure(
-        *(StructureErrors(log_creep=LogCreep(fraction_per_decade=f)) for f in (1e-4, 3e-4, 1e-3))
+        "log_creep", *(LogCreep(fraction_per_decade=f) for f in (1e-4, 3e-4, 1e-3))
     ),
     "base mode, 8 Hz": _soft_mode(8.0, 0.02),
     "isolator, 2.5 Hz": _soft_mode(2.5, 0.1),
-    "backlash": _structure(*(StructureErrors(backlash_m=w * NANOMETRE_M) for w in (10, 30, 100))),
+    "backlash": _structure("backlash_m", 10e-9, 30e-9, 100e-9),
     "friction": _structure(
-        *(
-            StructureErrors(friction=Friction(drag_m=d * NANOMETRE_M, presliding_m=MICROMETRE_M))
-            for d in (5, 15, 50)
-        )
+        "friction", *(Friction(drag_m=d, presliding_m=1e-6) for d in (5e-9, 15e-9, 50e-9))
     ),
-    "hardening": _structure(
-        *(StructureErrors(hardening_deflection_m=d * MICROMETRE_M) for d in (3.0, 1.0, 0.5))
-    ),
-    "stiffness along Z": _structure(
-        *(StructureErrors(compliance_per_m=c) for c in (20.0, 70.0, 200.0))
-    ),
+    "hardening": _structure("hardening_deflection_m", 3e-6, 1e-6, 0.5e-6),
+    "stiffness along Z": _structure("compliance_per_m_of_z", 20.0, 70.0, 200.0),
+    "stiffness along X": _structure("compliance_per_m_of_x", 2.0, 7.0, 20.0),
     "part tilted": _machine(
-        *(MachineErrors(pose=PartPose(tilt_x_rad=t, tilt_y_rad=-t)) for t in (5e-6, 20e-6, 50e-6))
+        "pose", *(PartPose(tilt_x_rad=t, tilt_y_rad=-t) for t in (5e-6, 20e-6, 50e-6))
     ),
-    "part decentred": _machine(
-        *(MachineErrors(pose=PartPose(x_m=d, y_m=-d)) for d in (0.5e-6, 2e-6, 5e-6))
+    "part decentred": _machine("pose", *(PartPose(x_m=d, y_m=-d) for d in (0.5e-6, 2e-6, 5e-6))),
+    "part clocked": _machine("pose", *(PartPose(clocking_rad=a) for a in (0.1e-3, 0.3e-3, 1e-3))),
+    "zero of X": _machine("mount", *(Geometry(centre_x=d) for d in (0.1e-6, 0.3e-6, 1e-6))),
+    "beam slanting": _machine("mount", *(Geometry(beam_x=s) for s in (1e-3, 3e-3, 10e-3))),
+    "B swinging": _machine("b_wobble_rad", 0.1e-6, 0.3e-6, 1e-6, mount=Geometry(probe_x=0.05)),
+    "spindle, axial twice a turn": _spindle("axial_m", 2.5e-9, 8e-9, 25e-9, per_turn=2),
+    "spindle, radial twice a turn": _spindle("radial_m", 10e-9, 30e-9, 100e-9, per_turn=2),
+    "spindle, tilt once a turn": _spindle("tilt_rad", 0.1e-6, 0.3e-6, 1e-6, per_turn=1),
+    "spindle, asynchronous": _machine(
+        "spindle", *(SpindleError(axial_noise_m=n, radial_noise_m=n) for n in (2e-9, 5e-9, 15e-9))
     ),
-    "part clocked": _machine(
-        *(MachineErrors(pose=PartPose(clocking_rad=a)) for a in (0.1e-3, 0.3e-3, 1e-3))
+    "straightness of X": _machine(
+        "x_slide_along_z",
+        *(Straightness(bow_m=b, half_travel_m=12.7e-3) for b in (10e-9, 30e-9, 100e-9)),
+    ),
+    "straightness of Z": _machine(
+        "z_slide_along_x",
+        *(Straightness(bow_m=b, half_travel_m=1e-3) for b in (10e-9, 30e-9, 100e-9)),
     ),
     "drift, steady": _drift("ramp_m_per_s", 0.1e-9, 0.3e-9, 1e-9),
     "drift, exponential": _drift("exponential_m", 20e-9, 60e-9, 200e-9),
@@ -116,6 +142,26 @@ CATALOGUE: dict[str, Sizes] = {
     "vibration, 680 Hz": _line(frequency_hz=680.0),
     "vibration, twice a step": _line(frequency_hz=4.0),
     "vibration, 11 times a turn": _line(per_turn=11.0),
+    "encoder scale": _encoder("scale_ppm", 1.0, 3.0, 10.0),
+    "encoder interpolation": _encoder("interpolation_m", 2e-9, 5e-9, 15e-9),
+    "encoder interpolation as the steps": _encoder(
+        "interpolation_m", 2e-9, 5e-9, 15e-9, signal_period_m=4.9e-6
+    ),
+    "encoder counts": _encoder("resolution_m", 1e-9, 3e-9, 10e-9),
+    "pitch, steady": _encoder(
+        "pitch",
+        *(Pitch(arm_m=0.1, periodic_rad=p, period_m=30e-6) for p in (0.02e-6, 0.07e-6, 0.2e-6)),
+    ),
+    "pitch, under acceleration": _encoder(
+        "pitch", *(Pitch(arm_m=0.1, rad_per_m_s2=p) for p in (0.1e-6, 0.3e-6, 1e-6))
+    ),
+    "trigger jitter": _clocks("trigger_jitter_s", 1e-6, 5e-6, 20e-6),
+    "probe jitter": _clocks("probe_jitter_s", 1e-6, 5e-6, 20e-6),
+    "probe clock offset": _clocks("probe_offset_s", 10e-6, 30e-6, 100e-6),
+    "probe clock drift": _clocks("probe_drift_ppm", 0.1, 0.3, 1.0),
+    "Z latched late": _clocks("z_latch_late_s", 10e-6, 30e-6, 100e-6),
+    "C latched late": _clocks("c_latch_late_s", 10e-6, 30e-6, 100e-6),
+    "reference late": _each("reference", ReferenceSensor, "latency_s", 0.02e-3, 0.06e-3, 0.2e-3),
 }
 """Small, medium and large of each disturbance by its name."""
 

@@ -6,19 +6,22 @@ and the encoder's noise, is what ``Disturbances`` lists; what is not stands in e
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Motion
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.clocks import Instants
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import Plant
-from omsm_ros.twin.probe import Probe, read
-from omsm_ros.twin.scene import scene_of
+from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
+from omsm_ros.twin.scene import Look, Scene, Timing, scene_of
 from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
@@ -55,15 +58,18 @@ class Cell:
 class Truth:
     """What only the twin knows beside the motion of the probe; arrays of shape (n,).
 
-    carriage: true Z of the carriage at the trigger [m]
+    time: when the trigger came [s];  carriage: true Z of the carriage then [m]
     x, y: where on the chuck the probe looked [m]
+    distance: true distance along the beam, before the probe's own errors [m]
     surface: the part as it sits on the chuck
-    response: the transfer function from encoder to probe
+    response: the transfer function from encoder to probe, and the share of latency in it
     """
 
+    time: FloatArray
     carriage: FloatArray
     x: FloatArray
     y: FloatArray
+    distance: FloatArray
     surface: Surface
     response: TrueResponse
 
@@ -72,7 +78,7 @@ class Truth:
 class Recording:
     """Samples as reported, one block each, and the truth behind them; arrays of shape (n,).
 
-    axes, distance: what the devices say
+    axes, distance: what the devices say;  reference, acceleration: if there are such
     probe_motion: true motion of the probe, G · X_d, when (on the mean) the reading was made [m]
     surface_height: true height of the surface then under the probe [m]
     truth: what else is true, None where nobody knows
@@ -84,11 +90,14 @@ class Recording:
     distance: DistanceBlock
     probe_motion: FloatArray
     surface_height: FloatArray
+    reference: DistanceBlock | None = None
+    acceleration: AccelerationBlock | None = None
     truth: Truth | None = None
 
     def motion_record(self) -> MotionRecord:
         """The samples on one grid, as an identification takes them."""
-        return assemble([self.axes], [self.distance])
+        reference = [self.reference] if self.reference else []
+        return assemble([self.axes], [self.distance], reference)
 
 
 def record(
@@ -99,51 +108,103 @@ def record(
     stand_off: height of the probe's zero above the axis zero [m]; the reading is
     ``scale · (surface - probe motion - stand_off)``, rounded, and a lost target beyond range.
     """
-    streams = _random_streams(cell.seed)
-    errors = cell.disturbances
-    late = replace(errors.probe, latency_s=errors.probe.latency_s + cell.latency)
-    errors = replace(errors, probe=late)
-    samples = round(motion.duration / cell.sample_period)
-    time = np.arange(samples) * cell.sample_period
-    scene = scene_of(
-        cell.plant, errors, motion, surface, samples, cell.sample_period, substeps, streams
-    )
-    seen = scene.over_an_exposure(time)
-    carriage, command = scene.carriage.at(time), motion.positions(time)
-    axes = AxisBlock(
-        stamp_ns=0,
-        first_sample=0,
-        sample_period=cell.sample_period,
-        x=command.x,
-        y=command.y,
-        z=carriage + streams["encoder"].normal(0.0, cell.encoder_noise, samples),
-        b=command.b,
-        c=command.c,
-    )
-    true_distance = seen.surface + (cell.drift * time + seen.raised) - seen.probe - stand_off
+    random = _random_streams(cell.seed)
+    errors = _with_the_cells_own(cell)
+    timing = Timing(round(motion.duration / cell.sample_period), cell.sample_period, substeps)
+    scene = scene_of(cell.plant, errors, motion, surface, stand_off, timing, random)
+    nominal = np.arange(timing.samples) * cell.sample_period
+    instants = errors.clocks.instants(nominal, random["clocks"])
+    seen = scene.over_an_exposure(instants.probe)
     return Recording(
-        axes=axes,
-        distance=read(cell.probe, late, true_distance, cell.sample_period, streams["probe"]),
+        axes=_axes(cell, scene, instants, random["encoder"]),
+        distance=_distance(cell, scene, instants, seen, random),
         probe_motion=seen.probe,
         surface_height=seen.surface,
+        **_further_channels(scene, instants, timing, random),
         truth=Truth(
-            carriage=carriage,
+            time=instants.trigger,
+            carriage=scene.carriage.at(instants.trigger),
             x=seen.x,
             y=seen.y,
+            distance=seen.distance,
             surface=scene.surface,
-            response=TrueResponse(cell.plant.dynamics.normalised(), errors.structure, late),
+            response=TrueResponse(cell.plant.dynamics, errors, cell.probe),
         ),
     )
 
 
 # A new stream goes to the end: those before it stay as they are.
-_STREAMS = ("encoder", "probe", "drift", "vibration")
+_STREAMS = (
+    *("encoder", "probe", "drift", "vibration"),
+    *("spindle", "clocks", "dropout", "reference", "accelerometer"),
+)
 
 
 def _random_streams(seed: int) -> dict[str, np.random.Generator]:
     """Independent random numbers for each use, so that switching one on leaves the others."""
     children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
+
+
+def _with_the_cells_own(cell: Cell) -> Disturbances:
+    """All disturbances, the latency and drift that the cell names itself among them."""
+    errors = cell.disturbances
+    drift = errors.machine.drift
+    drift = replace(drift, ramp_m_per_s=drift.ramp_m_per_s + cell.drift)
+    return replace(
+        errors,
+        probe=replace(errors.probe, latency_s=errors.probe.latency_s + cell.latency),
+        machine=replace(errors.machine, drift=drift),
+    )
+
+
+def _axes(cell: Cell, scene: Scene, when: Instants, random: np.random.Generator) -> AxisBlock:
+    encoder, slides = scene.disturbances.encoder, scene.positions(when.trigger)
+    z = encoder.seen(scene.carriage).at(when.z)
+    late = scene.positions(when.c).c if when.c is not when.trigger else slides.c
+    return AxisBlock(
+        stamp_ns=0,
+        first_sample=0,
+        sample_period=cell.sample_period,
+        x=slides.x,
+        y=slides.y,
+        z=encoder.read(z, random.normal(0.0, cell.encoder_noise, len(z))),
+        b=slides.b,
+        c=late,
+    )
+
+
+def _distance(
+    cell: Cell,
+    scene: Scene,
+    when: Instants,
+    seen: Look,
+    random: Mapping[str, np.random.Generator],
+) -> DistanceBlock:
+    errors, slope = scene.disturbances.probe, LEVEL
+    if errors.sees_slope:
+        c = scene.positions(when.probe - errors.lag_s).c
+        slope = slope_of(scene.surface, seen.x, seen.y, c)
+    streams = ProbeRandom(random["probe"], random["dropout"])
+    return read(cell.probe, errors, seen.distance, slope, cell.sample_period, streams)
+
+
+def _further_channels(
+    scene: Scene, when: Instants, timing: Timing, random: Mapping[str, np.random.Generator]
+) -> dict[str, Any]:
+    """Reference and acceleration, as far as there are such sensors."""
+    channels: dict[str, Any] = {}
+    if sensor := scene.disturbances.reference:
+        channels["reference"] = sensor.read(
+            scene.carriage, when.trigger, timing.period, random["reference"]
+        )
+    if sensor := scene.disturbances.accelerometer:
+        period = sensor.sample_period_s or timing.period
+        time = np.arange(round(timing.duration / period)) * period
+        channels["acceleration"] = sensor.read(
+            scene.acceleration(time, period), period, random["accelerometer"]
+        )
+    return channels
 
 
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:

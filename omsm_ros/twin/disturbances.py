@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.channels import Accelerometer, ReferenceSensor
+from omsm_ros.twin.clocks import ClockErrors
+from omsm_ros.twin.encoder import EncoderErrors
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.structure import StructureErrors
@@ -14,16 +18,32 @@ from omsm_ros.twin.vibration import VibrationLine
 class Disturbances:
     """One record a family; every quantity has its unit in its name.
 
+    servo_bandwidth_hz: of Z, None for the plant's own
     probe: when it looks and what it makes of a distance
     structure: between carriage and probe
-    machine: pose of the part, drift
+    machine: spindle, slides, drift, pose of the part, mount of the probe
+    encoder: of Z
+    clocks: when each device takes its sample
     vibration: lines between workpiece and probe
+    reference, accelerometer: further channels, None for none
     """
 
+    servo_bandwidth_hz: float | None = None
     probe: ProbeErrors = field(default_factory=ProbeErrors)
     structure: StructureErrors = field(default_factory=StructureErrors)
     machine: MachineErrors = field(default_factory=MachineErrors)
+    encoder: EncoderErrors = field(default_factory=EncoderErrors)
+    clocks: ClockErrors = field(default_factory=ClockErrors)
     vibration: tuple[VibrationLine, ...] = ()
+    reference: ReferenceSensor | None = None
+    accelerometer: Accelerometer | None = None
+
+    def __post_init__(self) -> None:
+        width = self.servo_bandwidth_hz
+        if width is not None and not 0 < width < float("inf"):
+            raise ConfigurationError(
+                f"Disturbances: servo_bandwidth_hz is {width!r}, expected None or a positive number"
+            )
 
 
 NOTHING = Disturbances()

@@ -1,78 +1,30 @@
-"""What the machine does that no encoder tells: the part's pose and thermal drift.
+"""What the machine does that no encoder tells: spindle, slides, drift, pose, mount of the probe.
 
-Signs: a positive height brings the workpiece nearer to the probe.
+Each is a shift of the workpiece against the probe: positive z brings it nearer. Not imitated:
+errors of Y and of the angle of C, roll of the slides, thermal growth that bends the part.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.machine.trajectories import AxisPositions
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.part_pose import PartPose
+from omsm_ros.twin.quantities import check_numbers
 from omsm_ros.twin.trajectory import Trajectory
 
-# Each turn of the iteration brings tilt times slope, at most a hundredth, of the error before.
-_POSE_ITERATIONS = 5
 
+class Shift(NamedTuple):
+    """Of the workpiece against the probe, in the machine frame [m]; arrays (n,) or (1,)."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PartPose:
-    """How the part sits on the chuck, from where it should.
-
-    x_m, y_m, z_m: shift of its origin
-    tilt_x_rad, tilt_y_rad: rotation about x and about y;  clocking_rad: about the spindle
-    """
-
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.0
-    tilt_x_rad: float = 0.0
-    tilt_y_rad: float = 0.0
-    clocking_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
-
-    @property
-    def rotation(self) -> FloatArray:
-        """From the part's frame to the chuck's (3, 3): about x, then y, then z."""
-        (sx, sy, sz), (cx, cy, cz) = (
-            f(np.array([self.tilt_x_rad, self.tilt_y_rad, self.clocking_rad]))
-            for f in (np.sin, np.cos)
-        )
-        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return np.asarray(about_z @ about_y @ about_x, np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class PosedSurface:
-    """``surface`` in the pose that it has on the chuck; heights are along the spindle."""
-
-    surface: Surface
-    pose: PartPose
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m] of the chuck, of their broadcast shape."""
-        pose, turn = self.pose, self.pose.rotation
-        across, along = np.asarray(x) - pose.x_m, np.asarray(y) - pose.y_m
-        z = self.surface.height(across, along)
-        for _ in range(_POSE_ITERATIONS):
-            # In the part's frame: p = Rᵀ (q - shift).
-            px, py, pz = (
-                turn[0, i] * across + turn[1, i] * along + turn[2, i] * z for i in range(3)
-            )
-            z = z + (self.surface.height(px, py) - pz) / turn[2, 2]
-        return np.asarray(z + pose.z_m, np.float64)
-
-
-def posed(surface: Surface, pose: PartPose) -> Surface:
-    """``surface`` on the chuck; itself where it sits as it should."""
-    return surface if is_default(pose) else PosedSurface(surface, pose)
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,24 +53,134 @@ class Drift:
 
     def height(self, time: FloatArray, walk: Trajectory) -> FloatArray:
         """Height [m] at ``time`` [s]; ``walk`` is a random walk of one metre per root second."""
-        return np.asarray(
+        moved = (
             self.ramp_m_per_s * time
             + self.exponential_m * -np.expm1(-time / self.time_constant_s)
             + self.sine_m * np.sin(2 * np.pi * time / self.period_s)
-            + (
-                self.random_walk_m_per_root_s * walk.at(time)
-                if self.random_walk_m_per_root_s
-                else 0.0
-            )
         )
+        if self.random_walk_m_per_root_s:
+            moved = moved + self.random_walk_m_per_root_s * walk.at(time)
+        return np.asarray(moved, np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Harmonic:
+    """A turning vector ``amplitude · (cos φ, sin φ)`` with ``φ = per_turn · c + phase_rad``.
+
+    amplitude: in the unit of what it is a harmonic of;  along one direction only its cosine
+    per_turn: turns of the vector a turn of the spindle; negative turns against it
+    """
+
+    amplitude: float
+    per_turn: int
+    phase_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+    def along(self, c: FloatArray) -> FloatArray:
+        """First component at spindle angle ``c`` [rad], of its shape."""
+        return np.asarray(self.amplitude * np.cos(self.per_turn * c + self.phase_rad), np.float64)
+
+    def across(self, c: FloatArray) -> FloatArray:
+        """Second component at spindle angle ``c`` [rad], of its shape."""
+        return np.asarray(self.amplitude * np.sin(self.per_turn * c + self.phase_rad), np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpindleError:
+    """Error motion of the spindle, in step with it and at random (ISO 230-7).
+
+    axial_m, radial_m, tilt_rad: harmonics;  tilt turns about the origin of X and Y
+    axial_noise_m, radial_noise_m, tilt_noise_rad: rms of the asynchronous part, white up to
+        half the trigger's rate
+    """
+
+    axial_m: tuple[Harmonic, ...] = ()
+    radial_m: tuple[Harmonic, ...] = ()
+    tilt_rad: tuple[Harmonic, ...] = ()
+    axial_noise_m: float = 0.0
+    radial_noise_m: float = 0.0
+    tilt_noise_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        names = ("axial_noise_m", "radial_noise_m", "tilt_noise_rad")
+        check_numbers(self, not_negative=names)
+
+    @property
+    def is_noisy(self) -> bool:
+        """True if any part of it is at random."""
+        return bool(self.axial_noise_m or self.radial_noise_m or self.tilt_noise_rad)
+
+    def shift(self, time: FloatArray, slides: AxisPositions, noise: list[Trajectory]) -> Shift:
+        """Of the workpiece under the probe; ``noise``: five signals of unit variance, or none."""
+        c = slides.c
+        axial, radial, tilt = self.axial_m, self.radial_m, self.tilt_rad
+        z = sum((h.along(c) for h in axial), np.zeros(1))
+        x, slope_x = (sum((h.along(c) for h in hs), np.zeros(1)) for hs in (radial, tilt))
+        y, slope_y = (sum((h.across(c) for h in hs), np.zeros(1)) for hs in (radial, tilt))
+        if noise:
+            random = [n.at(time) for n in noise]
+            z = z + self.axial_noise_m * random[0]
+            x, y = (p + self.radial_noise_m * r for p, r in zip((x, y), random[1:3], strict=True))
+            slope_x = slope_x + self.tilt_noise_rad * random[3]
+            slope_y = slope_y + self.tilt_noise_rad * random[4]
+        return Shift(x, y, z + slope_x * slides.x + slope_y * slides.y)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Straightness:
+    """Deviation of a slide from a straight line, over its position p.
+
+    ``bow_m · (p / half_travel_m)² + periodic_m · sin(2π p / period_m)``
+    """
+
+    bow_m: float = 0.0
+    half_travel_m: float = 0.1
+    periodic_m: float = 0.0
+    period_m: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("half_travel_m", "period_m"))
+
+    def deviation(self, position: FloatArray) -> FloatArray:
+        """[m] at ``position`` [m], of its shape."""
+        wave = self.periodic_m * np.sin(2 * np.pi * position / self.period_m)
+        return np.asarray(self.bow_m * (position / self.half_travel_m) ** 2 + wave, np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineErrors:
-    """All that the machine does and no encoder tells; nothing by default."""
+    """All that the machine does and no encoder tells; nothing by default.
+
+    pose: of the part on the chuck
+    mount: where the probe truly sits and looks; a correction that is not told it has it as error
+    x_slide_along_z: straightness of X towards the probe;  z_slide_along_x: of Z, sideways
+    b_wobble_rad, b_wobble_hz: B swings; its encoder tells
+    """
 
     pose: PartPose = field(default_factory=PartPose)
+    mount: Geometry = field(default_factory=Geometry)
+    spindle: SpindleError = field(default_factory=SpindleError)
+    x_slide_along_z: Straightness = field(default_factory=Straightness)
+    z_slide_along_x: Straightness = field(default_factory=Straightness)
     drift: Drift = field(default_factory=Drift)
+    b_wobble_rad: float = 0.0
+    b_wobble_hz: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("b_wobble_hz",))
+
+    def slides_shift(self, slides: AxisPositions) -> Shift:
+        """What straightness does to the workpiece against the probe, at the slides' positions."""
+        zero = np.zeros(1)
+        along = self.x_slide_along_z.deviation(slides.x)
+        # A probe that is carried sideways sees the workpiece go the other way.
+        return Shift(-self.z_slide_along_x.deviation(slides.z), zero, along)
+
+    def b_wobble(self, time: FloatArray) -> FloatArray:
+        """Swing of B [rad] at ``time`` [s], of its shape."""
+        return np.asarray(self.b_wobble_rad * np.sin(2 * np.pi * self.b_wobble_hz * time))
 
 
 def random_walk(times: FloatArray, random: np.random.Generator) -> FloatArray:

@@ -9,7 +9,7 @@ from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, F
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.figure_error import FigureError
-from omsm_ros.twin.machine_errors import PartPose
+from omsm_ros.twin.part_pose import PartPose
 
 
 @dataclass(frozen=True)

@@ -3,42 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.machine.kinematics import workpiece_xy
+from omsm_ros.core.machine.kinematics import Geometry, workpiece_points, workpiece_xy
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import AxisPositions, Motion
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.twin.channels import acceleration_of
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.machine_errors import posed, random_walk
+from omsm_ros.twin.machine_errors import Shift, random_walk
+from omsm_ros.twin.part_pose import posed
 from omsm_ros.twin.plant import Grid, Plant, move
 from omsm_ros.twin.quantities import is_default
 from omsm_ros.twin.structure import deform
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.twin.vibration import Vibration
 
+Random = Mapping[str, np.random.Generator]
+
 # Sample periods simulated beyond those asked for, so that a cubic has its four points.
 _SPARE_SAMPLES = 3
+# Each turn of the search for a slanting beam's end leaves slope times slant of the error before;
+# it ends when nothing changes by more than this [m].
+_MOST_BEAM_ITERATIONS = 12
+_BEAM_SETTLED_M = 1e-14
 
 
 class Look(NamedTuple):
     """What the probe looks at, each (n,) [m].
 
     probe: its own true Z;  surface: height of the part under it;  x, y: where, on the chuck
-    raised: how much nearer the part is than its height tells, by drift, vibration and the like
+    distance: true, along the beam
     """
 
     probe: FloatArray
     surface: FloatArray
     x: FloatArray
     y: FloatArray
-    raised: FloatArray
+    distance: FloatArray
 
 
-Raising = Callable[[FloatArray, AxisPositions], FloatArray]
+Shifting = Callable[[FloatArray, AxisPositions], Shift]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """``samples`` every ``period`` [s], each period simulated in ``substeps``."""
+
+    samples: int
+    period: float
+    substeps: int
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.samples * self.period
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,37 +68,86 @@ class Scene:
     """Everything as signals in time.
 
     carriage, probe: true Z [m];  surface: as it sits on the chuck
-    raising: what brings the part nearer, at a time and a position of the slides
+    stand_off: height of the probe's zero above the axis zero [m]
+    shifting: what moves the workpiece against the probe, at a time and a position of the slides
+    vibration: lines between workpiece and probe, which an accelerometer feels too
     """
 
     disturbances: Disturbances
     motion: Motion
     surface: Surface
+    stand_off: float
     carriage: Trajectory
     probe: Trajectory
-    raising: tuple[Raising, ...]
+    shifting: tuple[Shifting, ...]
+    vibration: Vibration
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """True positions of the axes, as commanded but for the wobble of B."""
+        slides = self.motion.positions(time)
+        if not self.disturbances.machine.b_wobble_rad:
+            return slides
+        return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
 
     def look(self, time: FloatArray) -> Look:
         """What is before the probe at ``time`` (n,) [s]."""
-        slides = self.motion.positions(time)
-        x, y = workpiece_xy(slides.x, slides.y, slides.c)
-        raised = np.zeros(1)
-        for raise_ in self.raising:
-            raised = raised + raise_(time, slides)
-        return Look(self.probe.at(time), self.surface.height(x, y), x, y, raised)
+        slides = self.positions(time)
+        x, y, raised = self._shift(time, slides)
+        shifted = slides._replace(x=slides.x - x, y=slides.y - y)
+        probe, mount = self.probe.at(time), self.disturbances.machine.mount
+        if is_default(mount) and not slides.b.any():
+            on_x, on_y = workpiece_xy(shifted.x, shifted.y, slides.c)
+            height = self.surface.height(on_x, on_y)
+            distance = height + raised - probe - self.stand_off
+            return Look(probe, height, on_x, on_y, distance)
+        return self._along_the_beam(mount, shifted, probe, raised)
+
+    def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
+        """Of the workpiece against the probe, all in all."""
+        total = Shift(np.zeros(1), np.zeros(1), np.zeros(1))
+        for shifting in self.shifting:
+            part = shifting(time, slides)
+            total = Shift(*(a + b for a, b in zip(total, part, strict=True)))
+        return total
+
+    def _along_the_beam(
+        self, mount: Geometry, slides: AxisPositions, probe: FloatArray, raised: FloatArray
+    ) -> Look:
+        """As ``look``, for a beam that slants or a probe that B carries about."""
+        zero = probe + self.stand_off - raised
+        distance = np.zeros_like(probe)
+        for _ in range(_MOST_BEAM_ITERATIONS):
+            at = workpiece_points(mount, (slides.x, slides.y, zero), slides.b, slides.c, distance)
+            height = self.surface.height(at.x, at.y)
+            change = height - at.height
+            distance = distance + change
+            if np.all(abs(change) < _BEAM_SETTLED_M):
+                break
+        return Look(probe, height, at.x, at.y, distance)
 
     def over_an_exposure(self, time: FloatArray) -> Look:
         """The mean of what is before the probe while it looks for the triggers at ``time``."""
-        before, weights = self.disturbances.probe.looks()
-        if len(before) == 1:
-            return self.look(time - before[0])
-        looks = [self.look(time - ago) for ago in before]
-        return Look(
-            *(
-                np.asarray(sum(w * part for w, part in zip(weights, parts, strict=True)))
-                for parts in zip(*looks, strict=True)
-            )
-        )
+        probe = self.disturbances.probe
+        before, weights = probe.looks()
+        look = self.look(time - before[0])
+        if len(before) > 1:
+            looks = (look, *(self.look(time - ago) for ago in before[1:]))
+            look = Look(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
+        if not self.vibration.lines:
+            return look
+        # Lines may be faster than the looks: their mean is known in closed form.
+        middle, half = time - probe.lag_s, probe.window_s / 2
+        begin, c, end = (self.motion.positions(middle + d).c for d in (-half, 0.0, half))
+        shaken = self.vibration.height(middle, c, probe.window_s, end - begin)
+        return look._replace(distance=look.distance + shaken)
+
+    def acceleration(self, time: FloatArray, period: float) -> FloatArray:
+        """Of the probe along Z [m/s²] at ``time`` (n,) [s]."""
+        c = self.motion.positions(time).c
+        speed = np.asarray(np.gradient(c, period))
+        shaken = self.vibration.acceleration(time, c, speed)
+        # What brings the part nearer moves the probe down.
+        return np.asarray(acceleration_of(self.probe).at(time) - shaken)
 
 
 def scene_of(
@@ -84,36 +155,62 @@ def scene_of(
     disturbances: Disturbances,
     motion: Motion,
     surface: Surface,
-    samples: int,
-    sample_period: float,
-    substeps: int,
-    random: Mapping[str, np.random.Generator],
+    stand_off: float,
+    timing: Timing,
+    random: Random,
 ) -> Scene:
-    """Simulate ``motion`` and gather what happens beside it.
+    """Simulate ``motion`` and gather what happens beside it; ``random`` by the name of the use."""
+    if disturbances.servo_bandwidth_hz is not None:
+        plant = replace(plant, servo_bandwidth=disturbances.servo_bandwidth_hz)
+    grid = _grid(plant, disturbances, timing)
+    times = np.arange(-grid.lead, grid.samples + 1) * timing.period
+    moved = move(plant, motion, grid)
+    if not is_default(disturbances.structure):
+        slide_x = Trajectory(times[0], timing.period, motion.positions(times).x)
+        moved = deform(disturbances.structure, moved, slide_x)
+    vibration = Vibration.of(disturbances.vibration, random["vibration"])
+    return Scene(
+        disturbances=disturbances,
+        motion=motion,
+        surface=posed(surface, disturbances.machine.pose),
+        stand_off=stand_off,
+        carriage=moved.carriage,
+        probe=moved.probe,
+        shifting=tuple(_shifting(disturbances, times, random)),
+        vibration=vibration,
+    )
 
-    substeps: simulated steps in a sample period;  random: by the name of the use
-    """
-    grid = _grid(plant, disturbances, samples, sample_period, substeps)
-    moved = deform(disturbances.structure, move(plant, motion, grid))
-    raising: list[Raising] = []
-    if not is_default(disturbances.machine.drift):
-        times = np.arange(-grid.lead, grid.samples + 1) * sample_period
-        walk = Trajectory(times[0], sample_period, random_walk(times, random["drift"]))
-        raising.append(lambda time, slides: disturbances.machine.drift.height(time, walk))
-    if disturbances.vibration:
-        vibration = Vibration.of(disturbances.vibration, random["vibration"])
-        raising.append(lambda time, slides: vibration.height(time, slides.c))
-    on_chuck = posed(surface, disturbances.machine.pose)
-    return Scene(disturbances, motion, on_chuck, moved.carriage, moved.probe, tuple(raising))
+
+def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> list[Shifting]:
+    """What is switched on of all that moves the workpiece; ``times`` span the simulation."""
+    machine, zero = disturbances.machine, np.zeros(1)
+    result: list[Shifting] = []
+    if not is_default(machine.drift):
+        walk = Trajectory(times[0], times[1] - times[0], random_walk(times, random["drift"]))
+        result.append(lambda time, slides: Shift(zero, zero, machine.drift.height(time, walk)))
+    if not is_default(machine.spindle):
+        noise = [
+            Trajectory(times[0], times[1] - times[0], random["spindle"].normal(size=len(times)))
+            for _ in range(5 if machine.spindle.is_noisy else 0)
+        ]
+        result.append(lambda time, slides: machine.spindle.shift(time, slides, noise))
+    if not (is_default(machine.x_slide_along_z) and is_default(machine.z_slide_along_x)):
+        result.append(lambda time, slides: machine.slides_shift(slides))
+    return result
 
 
-def _grid(
-    plant: Plant, disturbances: Disturbances, samples: int, period: float, substeps: int
-) -> Grid:
-    forgotten = int(np.ceil(plant.lead_in() / period))
+def _grid(plant: Plant, disturbances: Disturbances, timing: Timing) -> Grid:
+    forgotten = int(np.ceil(plant.lead_in() / timing.period))
     if is_default(disturbances):
-        return Grid(forgotten, samples, period, substeps, every=substeps)
-    probe = disturbances.probe
-    earlier = probe.latency_s + probe.window_s + disturbances.structure.lead_s
-    lead = forgotten + int(np.ceil(earlier / period)) + _SPARE_SAMPLES
-    return Grid(lead, samples + _SPARE_SAMPLES, period, substeps, every=1)
+        return Grid(forgotten, timing.samples, timing.period, timing.substeps, timing.substeps)
+    probe, clocks = disturbances.probe, disturbances.clocks.reach_s(timing.duration)
+    reference = disturbances.reference.latency_s if disturbances.reference else 0.0
+    late = max(probe.latency_s + probe.window_s, reference)
+    lead = late + clocks + disturbances.structure.lead_s
+    return Grid(
+        lead=forgotten + int(np.ceil(lead / timing.period)) + _SPARE_SAMPLES,
+        samples=timing.samples + int(np.ceil(clocks / timing.period)) + _SPARE_SAMPLES,
+        sample_period=timing.period,
+        substeps=timing.substeps,
+        every=1,
+    )

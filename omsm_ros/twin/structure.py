@@ -108,7 +108,8 @@ class StructureErrors:
     """Between carriage and probe; nothing by default.
 
     creep, log_creep, soft_modes: linear, slow
-    compliance_per_m: the deflection ``carriage - probe`` grows by this part per metre of Z
+    compliance_per_m_of_z, compliance_per_m_of_x: the deflection ``carriage - probe`` grows by
+        this part per metre of Z or X
     hardening_deflection_m: deflection at which a hardening spring has twice its stiffness
     backlash_m: lost motion at a reversal, the full width of the loop
     friction: pre-sliding drag
@@ -117,7 +118,8 @@ class StructureErrors:
     creep: tuple[Creep, ...] = ()
     log_creep: LogCreep | None = None
     soft_modes: tuple[SoftMode, ...] = ()
-    compliance_per_m: float = 0.0
+    compliance_per_m_of_z: float = 0.0
+    compliance_per_m_of_x: float = 0.0
     hardening_deflection_m: float | None = None
     backlash_m: float = 0.0
     friction: Friction | None = None
@@ -146,13 +148,21 @@ class StructureErrors:
         return result
 
 
-def deform(errors: StructureErrors, moved: Movement) -> Movement:
-    """What becomes of the probe's motion ``moved`` in a structure with ``errors``."""
+def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Movement:
+    """What becomes of the probe's motion ``moved`` in a structure with ``errors``.
+
+    slide_x: position of X [m], on any grid as long as that of ``moved``
+    """
     if is_default(errors):
         return moved
     carriage, probe = moved.carriage.values, moved.probe.values
     probe = probe + _slow_parts(errors, moved.probe)
-    probe = _stiffened(errors, carriage, probe)
+    if errors.compliance_per_m_of_z or errors.compliance_per_m_of_x:
+        x = np.interp(moved.probe.times, slide_x.times, slide_x.values)
+        along = errors.compliance_per_m_of_z * carriage + errors.compliance_per_m_of_x * x
+        probe = carriage - (carriage - probe) * (1 + along)
+    if errors.hardening_deflection_m is not None:
+        probe = carriage - hardened(carriage - probe, errors.hardening_deflection_m)
     if errors.backlash_m:
         probe = backlash(probe, errors.backlash_m)
     if errors.friction:
@@ -189,15 +199,6 @@ def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: f
     """``values`` at rest before, joined by straight lines, through a continuous filter: exactly."""
     numerator, denominator, _ = signal.cont2discrete(ratio, step, method="foh")
     return np.asarray(signal.lfilter(numerator.ravel(), denominator, values))
-
-
-def _stiffened(errors: StructureErrors, carriage: FloatArray, probe: FloatArray) -> FloatArray:
-    if not errors.compliance_per_m and errors.hardening_deflection_m is None:
-        return probe
-    deflection = (carriage - probe) * (1 + errors.compliance_per_m * carriage)
-    if errors.hardening_deflection_m is not None:
-        deflection = hardened(deflection, errors.hardening_deflection_m)
-    return np.asarray(carriage - deflection)
 
 
 def hardened(linear: FloatArray, scale: float) -> FloatArray:

@@ -8,40 +8,55 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.structure import StructureErrors
+from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.probe import Probe
 
 
 @dataclass(frozen=True, eq=False)
 class TrueResponse:
-    """From encoder to probe reading, with a gain of 1 at rest; what is not linear is not in it."""
+    """From encoder to probe reading; what is not linear is not in it.
 
-    dynamics: TransferFunction
-    structure: StructureErrors
-    probe: ProbeErrors
+    Nor is what varies along Z or X, nor periodic pitch, nor a clock's drift: these are as at
+    position 0 and time 0.
+    """
+
+    plant_dynamics: TransferFunction
+    disturbances: Disturbances
+    probe: Probe
 
     def response(self, frequency: ArrayLike) -> ComplexArray:
-        """G at ``frequency`` [Hz], of its shape: structure, latency and exposure."""
+        """G at ``frequency`` [Hz], of its shape, with a gain of 1 at rest."""
         f = np.asarray(frequency, np.float64)
         return self.structural_response(f) * self.probe_response(f)
 
     def structural_response(self, frequency: ArrayLike) -> ComplexArray:
         """The part by which only Z is late, of the shape of ``frequency`` [Hz]."""
         s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
-        return self.dynamics.at(s) * self.structure.response(s)
+        moved = self.plant_dynamics.normalised().at(s) * self.disturbances.structure.response(s)
+        seen = self.disturbances.encoder.response(s) / self._encoder_gain
+        return np.asarray(moved / seen, np.complex128)
 
     def probe_response(self, frequency: ArrayLike) -> ComplexArray:
         """The part by which the reading is late, so X and C too, of ``frequency`` [Hz]."""
         f = np.asarray(frequency, np.float64)
-        turning = np.exp(-2j * np.pi * f * self.probe.lag_s)
-        return np.asarray(turning * np.sinc(f * self.probe.window_s), np.complex128)
+        turning = np.exp(-2j * np.pi * f * self.latency_s)
+        return np.asarray(turning * np.sinc(f * self.disturbances.probe.window_s), np.complex128)
+
+    @property
+    def static_gain(self) -> float:
+        """Reading per travel of the encoder at rest [1]."""
+        return self.probe.scale * self.plant_dynamics.dc_gain / self._encoder_gain
+
+    @property
+    def _encoder_gain(self) -> float:
+        return float(self.disturbances.encoder.response(np.zeros(1, np.complex128))[0].real)
 
     @property
     def latency_s(self) -> float:
-        """How late the probe's reading is."""
-        return self.probe.lag_s
+        """How late the probe's reading is against the encoder of Z, at time 0."""
+        return self.disturbances.probe.lag_s + self.disturbances.clocks.lag_s
 
     @property
     def latency_share(self) -> float:
         """Latency per whole lag [1]; creep and soft modes, which are slow, are not counted."""
-        return self.latency_s / (self.latency_s + self.dynamics.low_frequency_delay)
+        return self.latency_s / (self.latency_s + self.plant_dynamics.low_frequency_delay)

@@ -38,10 +38,14 @@ class VibrationLine:
             )
 
     def height(self, time: FloatArray, c: FloatArray, random_phase: float) -> FloatArray:
-        """Height [m] at ``time`` [s] and spindle angle ``c`` [rad], of their shape."""
+        """Height [m] at ``time`` (n,) [s] and spindle angle ``c`` (n,) [rad]."""
         phase = random_phase if self.phase_rad is None else self.phase_rad
         turning = 2 * np.pi * self.frequency_hz * time + self.per_turn * c + phase
         return np.asarray(self.amplitude_m * np.sin(turning), np.float64)
+
+    def turn(self, duration_s: float, spindle_rad: FloatArray) -> FloatArray:
+        """How far its phase turns [rad] in a time in which the spindle turns by so much (n,)."""
+        return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
 
 
 @dataclass(frozen=True)
@@ -56,9 +60,23 @@ class Vibration:
         """The lines with phases by ``random`` where none is given."""
         return cls(lines, random.uniform(0.0, 2 * np.pi, len(lines)).tolist())
 
-    def height(self, time: FloatArray, c: FloatArray) -> FloatArray:
-        """Sum of all lines [m] at ``time`` [s] and ``c`` [rad]."""
-        total = np.zeros(1)
+    def height(
+        self, middle: FloatArray, c: FloatArray, exposure_s: float, turned: FloatArray
+    ) -> FloatArray:
+        """Sum of all lines [m], each the mean over an exposure.
+
+        middle: of the exposures (n,) [s];  c: spindle angle then (n,) [rad]
+        turned: by the spindle within an exposure (n,) [rad]
+        """
+        total = np.zeros_like(middle)
         for line, phase in zip(self.lines, self.phases, strict=True):
-            total = total + line.height(time, c, phase)
+            dimmed = np.sinc(line.turn(exposure_s, turned) / (2 * np.pi))
+            total += dimmed * line.height(middle, c, phase)
+        return total
+
+    def acceleration(self, time: FloatArray, c: FloatArray, spindle: FloatArray) -> FloatArray:
+        """Second derivative of the height [m/s²] at speeds ``spindle`` (n,) [rad/s]."""
+        total = np.zeros_like(time)
+        for line, phase in zip(self.lines, self.phases, strict=True):
+            total -= line.turn(1.0, spindle) ** 2 * line.height(time, c, phase)
         return total

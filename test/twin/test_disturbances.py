@@ -14,7 +14,7 @@ from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
 from omsm_ros.twin.cell import Cell, Probe, record
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
@@ -25,7 +25,7 @@ from omsm_ros.units import NANOMETRE_M
 QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0)
 MIDDLE = -49e-6
 FLAT = Flat()
-SMALL = Spiral(PAPER_MIRROR, start_radius=1e-3, feed_per_turn=2e-4, spindle_speed=30.0)
+SMALL = Spiral(PAPER_MIRROR, start_radius=1e-3, feed_per_turn=5e-4, spindle_speed=30.0)
 
 
 def quiet(disturbances, motion, surface=FLAT, **kwargs):
@@ -49,7 +49,8 @@ class Swing:
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_the_catalogue_rises_in_size_and_halving_the_step_changes_nothing(name):
     assert len(CATALOGUE[name]) == len(SIZES) == len(set(CATALOGUE[name]))
-    for motion, surface, where in ((StepTest(), Flat(), MIDDLE), (SMALL, PAPER_MIRROR, 0.0)):
+    short = StepTest(count=2)
+    for motion, surface, where in ((short, FLAT, MIDDLE), (SMALL, PAPER_MIRROR, 0.0)):
         coarse, fine = (
             quiet(CATALOGUE[name][-1], motion, surface, stand_off=where, substeps=n)
             for n in (16, 32)
@@ -59,17 +60,32 @@ def test_the_catalogue_rises_in_size_and_halving_the_step_changes_nothing(name):
         assert np.max(abs(coarse.probe_motion - fine.probe_motion)) < 0.1 * NANOMETRE_M
 
 
+# What brings the part nearer than its height tells, and what falsifies a reading.
+RAISING = (
+    *("drift", "vibration", "straightness of X", "beam", "B swinging"),
+    *("spindle, axial", "spindle, tilt", "spindle, asynchronous"),
+)
+MISREADING = ("noise", "linearity", "slope error")
+
+
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_a_reading_is_the_true_surface_less_the_true_motion_and_what_is_named(name):
     """Probe motion and reading give the true surface at the place that was looked at."""
-    made = quiet(CATALOGUE[name][-1], SMALL, PAPER_MIRROR)
+    made = quiet(CATALOGUE[name][-1], SMALL, PAPER_MIRROR, stand_off=20e-6)
     truth = made.truth
     expected = truth.surface.height(truth.x, truth.y)
     # Within an exposure the mean height is not the height at the mean place, by h''(vt)²/24.
     np.testing.assert_allclose(made.surface_height, expected, rtol=0, atol=2e-11)
-    unexplained = made.distance.distance + made.probe_motion - made.surface_height
-    raised = name.startswith(("drift", "vibration"))
-    assert (np.std(unexplained) > NANOMETRE_M) if raised else np.ptp(unexplained) < 1e-15
+    raised = truth.distance + made.probe_motion + 20e-6 - made.surface_height
+    if name.startswith(RAISING):
+        assert np.max(abs(raised)) > 0.1 * NANOMETRE_M
+    else:
+        assert np.ptp(raised) < 1e-15
+    reading_error = (made.distance.distance - truth.distance)[made.distance.ok]
+    if name.startswith(MISREADING):
+        assert np.max(abs(reading_error)) > 0.1 * NANOMETRE_M
+    else:
+        assert np.ptp(reading_error) < 1e-15
 
 
 def test_switching_one_on_leaves_the_noise_of_the_others():
@@ -134,7 +150,8 @@ def test_the_reading_belongs_to_the_middle_of_the_exposure():
     )
     assert exposed.truth.response.latency_s == pytest.approx(0.4e-3)
     assert np.max(abs(half.truth.x - exposed.truth.x)) < 1e-9
-    assert np.max(abs(half.distance.distance - exposed.distance.distance)) < 1e-11
+    # The feed sets in at time 0, which an exposure blurs.
+    assert np.max(abs(half.distance.distance - exposed.distance.distance)) < 5e-11
 
 
 def _spectrum(values, period=1e-3):
@@ -254,5 +271,5 @@ def test_every_pair_of_the_catalogue_can_be_or_says_why_not():
                 failed += 1
             else:
                 made += 1
-                assert both == first[-1] or both != second[-1] or first is second
+                assert both != NOTHING
     assert failed < 0.05 * made

@@ -1,67 +1,176 @@
-"""Pose and drift against closed forms."""
+"""Drift, spindle, slides and the mount of the probe against closed forms."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
+from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.machine.trajectories import AxisPositions, Circle, Spiral
+from omsm_ros.core.surface.nominal import Flat, Sphere
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.machine_errors import Drift, PartPose, PosedSurface, posed, random_walk
+from omsm_ros.twin.cell import Cell, Probe, record
+from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.machine_errors import (
+    Drift,
+    Harmonic,
+    MachineErrors,
+    SpindleError,
+    Straightness,
+    random_walk,
+)
 from omsm_ros.twin.trajectory import Trajectory
 
-ALL_SIX = PartPose(
-    x_m=5e-6, y_m=-3e-6, z_m=1e-6, tilt_x_rad=1e-3, tilt_y_rad=-2e-3, clocking_rad=0.3
+QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0, half_range=1e-3)
+RADIUS = 8e-3
+
+
+def _seen(machine, motion, surface=None):
+    cell = Cell(probe=QUIET, encoder_noise=0.0, disturbances=Disturbances(machine=machine))
+    return record(cell, motion, surface or Flat())
+
+
+def _turn(surface=None):
+    return Circle(surface or Flat(), RADIUS, 30.0, turns=2.0)
+
+
+def _angle():
+    return np.arange(4000) * 1e-3 * np.pi
+
+
+def _spindle(**kwargs):
+    return MachineErrors(spindle=SpindleError(**kwargs))
+
+
+def test_axial_error_is_read_as_it_is():
+    made = _seen(_spindle(axial_m=(Harmonic(amplitude=25e-9, per_turn=2, phase_rad=0.3),)), _turn())
+    expected = 25e-9 * np.cos(2 * _angle() + 0.3)
+    np.testing.assert_allclose(made.distance.distance, expected, atol=1e-18)
+    np.testing.assert_array_equal(made.surface_height, 0.0)  # the part is not to blame
+
+
+def test_tilt_grows_with_the_radius():
+    tilt = (Harmonic(amplitude=1e-6, per_turn=1),)
+    made = _seen(_spindle(tilt_rad=tilt), _turn())
+    np.testing.assert_allclose(made.distance.distance, 1e-6 * RADIUS * np.cos(_angle()), atol=1e-18)
+    spiral = Spiral(Flat(), RADIUS, 2e-3, 30.0)
+    made = _seen(_spindle(tilt_rad=tilt), spiral)
+    assert np.ptp(made.distance.distance[-2000:]) < 0.3 * np.ptp(made.distance.distance[:2000])
+
+
+def test_radial_error_moves_the_place_that_is_looked_at():
+    """A vector that stands still in the machine shifts the part against the probe there."""
+    still = (Harmonic(amplitude=2e-6, per_turn=0, phase_rad=np.pi / 3),)
+    made = _seen(_spindle(radial_m=still), _turn())
+    c, x, y = _angle(), RADIUS - 2e-6 * np.cos(np.pi / 3), -2e-6 * np.sin(np.pi / 3)
+    np.testing.assert_allclose(made.truth.x, x * np.cos(c) + y * np.sin(c), atol=1e-15)
+    np.testing.assert_allclose(made.truth.y, -x * np.sin(c) + y * np.cos(c), atol=1e-15)
+
+
+def test_radial_error_once_a_turn_is_eccentricity():
+    """Turning with the part, in the part's frame it is a fixed shift."""
+    once = (Harmonic(amplitude=2e-6, per_turn=1),)
+    made = _seen(_spindle(radial_m=once), _turn())
+    clean = _seen(MachineErrors(), _turn())
+    # The machine turns positions back by c, so the vector (cos c, sin c) becomes (1, 0).
+    np.testing.assert_allclose(made.truth.x - clean.truth.x, -2e-6, atol=1e-15)
+    np.testing.assert_allclose(made.truth.y - clean.truth.y, 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "expected"),
+    [("axial_noise_m", 5e-9, 5e-9), ("tilt_noise_rad", 1e-6, 1e-6 * RADIUS)],
 )
+def test_asynchronous_error_has_its_rms(name, size, expected):
+    made = _seen(_spindle(**{name: size}), _turn())
+    assert np.std(made.distance.distance) == pytest.approx(expected, rel=0.05)
 
 
-def _plane():
-    line = np.linspace(-1, 1, 21) * PAPER_MIRROR_RADIUS_M * 0.7
-    return (axis.ravel() for axis in np.meshgrid(line, line))
+def test_asynchronous_radial_error_has_its_rms():
+    made = _seen(_spindle(radial_noise_m=1e-7), _turn())
+    clean = _seen(MachineErrors(), _turn())
+    for axis in ("x", "y"):
+        moved = getattr(made.truth, axis) - getattr(clean.truth, axis)
+        assert np.std(moved) == pytest.approx(1e-7, rel=0.05)
 
 
-def test_a_tilted_flat_is_a_plane():
-    x, y = _plane()
-    a, b = 1e-3, 2e-3
-    found = PosedSurface(Flat(), PartPose(tilt_x_rad=a, tilt_y_rad=b)).height(x, y)
-    # Normal of the flat after a turn about x, then y: (cos a sin b, -sin a, cos a cos b).
-    expected = -(x * np.cos(a) * np.sin(b) - y * np.sin(a)) / (np.cos(a) * np.cos(b))
-    np.testing.assert_allclose(found, expected, atol=1e-17)
+def test_a_bowed_slide_makes_a_bowed_profile():
+    bow = Straightness(bow_m=100e-9, half_travel_m=10e-3, periodic_m=20e-9, period_m=1e-3)
+    spiral = Spiral(Flat(), RADIUS, 1e-3, 30.0)
+    made = _seen(MachineErrors(x_slide_along_z=bow), spiral)
+    x = made.axes.x
+    expected = 100e-9 * (x / 10e-3) ** 2 + 20e-9 * np.sin(2 * np.pi * x / 1e-3)
+    np.testing.assert_allclose(made.distance.distance, expected, atol=1e-18)
 
 
-def test_a_shifted_sphere_is_a_sphere_elsewhere():
-    x, y = _plane()
-    found = PosedSurface(Sphere(0.1), PartPose(x_m=1e-3, y_m=2e-3, z_m=3e-6)).height(x, y)
-    expected = 3e-6 + 0.1 - np.sqrt(0.01 - (x - 1e-3) ** 2 - (y - 2e-3) ** 2)
-    np.testing.assert_allclose(found, expected, atol=1e-16)
+def test_a_crooked_z_slide_carries_the_probe_sideways():
+    """On a slope of 0.1 the place is off by the straightness at that Z."""
+    crooked = Straightness(bow_m=1e-6, half_travel_m=1e-3)
+
+    @dataclass(frozen=True)
+    class Plunge:
+        duration: float = 1.0
+
+        def positions(self, time):
+            zero = np.zeros_like(time)
+            z = 0.5e-3 * np.sin(2 * np.pi * time)
+            return AxisPositions(zero, zero, z, zero, zero)
+
+    made = _seen(MachineErrors(z_slide_along_x=crooked), Plunge())
+    z = 0.5e-3 * np.sin(2 * np.pi * np.arange(1000) * 1e-3)
+    np.testing.assert_allclose(made.truth.x, 1e-6 * (z / 1e-3) ** 2, atol=1e-15)
 
 
-def test_a_sphere_turned_about_its_centre_is_the_same():
-    tilt, r = 2e-3, 0.1
-    # The centre is at (0, 0, r); a turn about y through the origin takes it to (r sin, 0, r cos).
-    pose = PartPose(tilt_y_rad=tilt, x_m=-r * np.sin(tilt), z_m=r * (1 - np.cos(tilt)))
-    x, y = _plane()
-    np.testing.assert_allclose(
-        PosedSurface(Sphere(r), pose).height(x, y), Sphere(r).height(x, y), atol=1e-15
+@dataclass(frozen=True)
+class Swivel:
+    """B turns the probe over a surface while everything else stands."""
+
+    at_x: float = 0.0
+    at_z: float = 0.0
+    duration: float = 1.0
+
+    def positions(self, time):
+        one = np.ones_like(time)
+        b = 0.1 * np.sin(2 * np.pi * time)
+        return AxisPositions(self.at_x * one, 0.0 * one, self.at_z * one, b, 0.7 * one)
+
+
+@pytest.mark.parametrize("beam", [(0.0, 0.0), (0.02, -0.01)], ids=["straight", "slanting"])
+def test_a_beam_ends_where_a_ray_meets_the_sphere(beam):
+    r, pivot = 0.2, 0.05
+    mount = Geometry(probe_x=1e-3, probe_z=pivot, beam_x=beam[0], beam_y=beam[1])
+    # The probe's zero starts at the pivot's height plus its arm: put the pivot below the sphere.
+    made = _seen(MachineErrors(mount=mount), Swivel(at_x=2e-3, at_z=-pivot), Sphere(r))
+    b = made.axes.b
+    turn = np.array([[np.cos(b), 0 * b, np.sin(b)], [0 * b, 1 + 0 * b, 0 * b],
+                     [-np.sin(b), 0 * b, np.cos(b)]])  # fmt: skip
+    # The mount is given relative to the arm at b = 0, so the pivot is one arm behind it.
+    arm = np.array([1e-3, 0.0, pivot])
+    origin = (
+        np.array([2e-3, 0.0, -pivot])[:, None] + np.einsum("ijk,j->ik", turn, arm) - arm[:, None]
     )
+    ray = np.array([*beam, 1.0])
+    ray = np.einsum("ijk,j->ik", turn, ray / np.linalg.norm(ray))
+    to_centre = origin - np.array([0.0, 0.0, r])[:, None]
+    half = np.sum(ray * to_centre, axis=0)
+    # The lower side of a sphere that stands on the plane is met first.
+    met = -half - np.sqrt(half**2 - np.sum(to_centre**2, axis=0) + r**2)
+    np.testing.assert_allclose(made.truth.distance, met, atol=1e-11)
 
 
-def test_every_point_of_a_posed_mirror_lies_on_the_mirror_when_put_back():
-    x, y = _plane()
-    z = PosedSurface(PAPER_MIRROR, ALL_SIX).height(x, y)
-    shift = np.array([[ALL_SIX.x_m], [ALL_SIX.y_m], [ALL_SIX.z_m]])
-    back = ALL_SIX.rotation.T @ (np.array([x, y, z]) - shift)
-    np.testing.assert_allclose(back[2], PAPER_MIRROR.height(back[0], back[1]), atol=1e-13)
-
-
-def test_clocking_turns_the_part_about_the_spindle():
-    x, y = _plane()
-    turned = PosedSurface(PAPER_MIRROR, PartPose(clocking_rad=np.pi / 2)).height(x, y)
-    np.testing.assert_allclose(turned, PAPER_MIRROR.height(y, -x), atol=1e-17)
-
-
-def test_a_part_that_sits_right_is_itself():
-    assert posed(PAPER_MIRROR, PartPose()) is PAPER_MIRROR
+def test_the_cores_kinematics_find_the_place_again():
+    mount = Geometry(centre_x=3e-6, centre_y=-2e-6, probe_z=0.05, beam_x=0.01)
+    machine = MachineErrors(mount=mount, b_wobble_rad=50e-6, b_wobble_hz=3.0)
+    made = _seen(machine, _turn(Sphere(0.3)), Sphere(0.3))
+    axes = made.axes
+    assert np.ptp(axes.b) == pytest.approx(100e-6, rel=1e-3)
+    slides = (axes.x, axes.y, made.probe_motion)
+    found = workpiece_points(mount, slides, axes.b, axes.c, made.distance.distance)
+    np.testing.assert_allclose(found.x, made.truth.x, atol=1e-14)
+    np.testing.assert_allclose(found.y, made.truth.y, atol=1e-14)
+    np.testing.assert_allclose(found.height, made.surface_height, atol=1e-13)
 
 
 STILL = Trajectory(-1.0, 1.0, np.zeros(10))
@@ -93,5 +202,7 @@ def test_a_random_walk_spreads_with_the_root_of_time():
 def test_sizes_that_cannot_be_are_named():
     with pytest.raises(ConfigurationError, match="period_s"):
         Drift(period_s=0.0)
-    with pytest.raises(ConfigurationError, match="tilt_x_rad"):
-        PartPose(tilt_x_rad=np.inf)
+    with pytest.raises(ConfigurationError, match="half_travel_m"):
+        Straightness(half_travel_m=-1.0)
+    with pytest.raises(ConfigurationError, match="axial_noise_m"):
+        SpindleError(axial_noise_m=-1e-9)

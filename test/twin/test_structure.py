@@ -26,7 +26,8 @@ STEP_S = 1e-3
 def _deformed(errors, carriage, probe=None, start=-10.0):
     """Motion of the probe where the clean one would be ``probe``, by default the carriage's."""
     made = [Trajectory(start, STEP_S, z) for z in (carriage, carriage if probe is None else probe)]
-    return deform(errors, Movement(*made)).probe.values
+    slide_x = Trajectory(start, 1.0, np.arange(60) * 1e-4)
+    return deform(errors, Movement(*made), slide_x).probe.values
 
 
 def _times(duration=30.0, start=-10.0):
@@ -142,8 +143,15 @@ def test_a_hardening_spring_obeys_its_law():
 def test_stiffness_changes_the_deflection_along_z():
     carriage = np.linspace(-1e-3, 1e-3, 2001)
     probe = carriage - 300e-9
-    found = _deformed(StructureErrors(compliance_per_m=100.0), carriage, probe)
+    found = _deformed(StructureErrors(compliance_per_m_of_z=100.0), carriage, probe)
     np.testing.assert_allclose(carriage - found, 300e-9 * (1 + 100 * carriage), atol=1e-18)
+
+
+def test_stiffness_changes_the_deflection_along_x():
+    carriage = np.zeros(2001)
+    found = _deformed(StructureErrors(compliance_per_m_of_x=50.0), carriage, carriage - 300e-9)
+    x = np.arange(2001) * STEP_S * 1e-4  # a tenth of a millimetre a second
+    np.testing.assert_allclose(carriage - found, 300e-9 * (1 + 50 * x), atol=1e-18)
 
 
 @pytest.mark.parametrize(
