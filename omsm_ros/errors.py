@@ -66,3 +66,20 @@ class DeviceError(OmsmError, OSError):
 
 class DeviceTimeoutError(DeviceError, TimeoutError):
     """A device did not answer in time."""
+
+
+DEBUG = "OMSM_DEBUG"
+"""Environment variable that, when set, shows the traceback of a defect."""
+
+
+def defect(err: BaseException) -> str:
+    """Return one line about an exception that nobody foresaw: what to report, and how."""
+    trace = err.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    place = "" if trace is None else f" in {trace.tb_frame.f_code.co_name}:{trace.tb_lineno}"
+    said = " ".join(str(err).split())[:200]
+    return (
+        f"a defect of omsm_ros, not of your input: {type(err).__name__}: {said}{place}; "
+        f"please report this line and the input, with the traceback that {DEBUG}=1 shows"
+    )

@@ -160,7 +160,13 @@ GAIN_UNCERTAINTY = Quantity("standard uncertainty", "", 0.0, 1e6, "give it as a 
 BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2")
 LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
 
+STAMP_DELAY = Quantity("delay of the exposure", "s", -10.0, 10.0, "give it in seconds")
+EXPOSURE = Quantity("exposure", "s", 0.0, 10.0, "give it in seconds")
+
 # ------------------------------------------------------------------- arguments, parameters
+
+DWELL = Quantity("dwell", "s", 1e-6, 100.0, "give it in seconds")
+RISE = Quantity("rise", "s", 1e-7, 100.0, "give it in seconds")
 
 COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)

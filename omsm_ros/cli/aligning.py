@@ -6,6 +6,8 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
 from omsm_ros.jobs.study_scans import alignment_of, sideways_lag_of
@@ -56,7 +58,9 @@ def _show_reversal(facts: Facts) -> None:
 def _declare_align(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path, help="a scan of a reference sphere")
     sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument("--radius", type=float, required=True, help="[m], negative if convex")
+    sub.add_argument(
+        "--radius", type=number(quantities.RADIUS), required=True, help="[m], negative if convex"
+    )
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="what is known")
     sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
 

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
-from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.core.verification.change import compare
@@ -27,9 +29,13 @@ from omsm_ros.units import DEGREE_RAD, MICROSECOND_S, NANOMETRE_M
 def _declare_identify(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path, help="a step test, or any motion, on a fixed target")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument("--order", type=int, default=0, help="number of poles; 0 = choose")
+    sub.add_argument(
+        "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
+    )
     sub.add_argument("--input", choices=("encoder", "reference"), default="encoder")
-    sub.add_argument("--duration", type=float, default=0.0, help="seconds to use; 0 = all")
+    sub.add_argument(
+        "--duration", type=number(quantities.DURATION), default=0.0, help="[s] to use; 0 = all"
+    )
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
@@ -42,8 +48,12 @@ def _identify(args: argparse.Namespace) -> Facts:
     with progress_bar("reading", args.json) as progress:
         motion = motion_of_bag(args.bag, duration=args.duration, progress=progress)
     identified = identify(motion, order=args.order, input=args.input, settings=args.settings)
-    save_calibration(args.out, identified.calibration)
-    facts = calibration_facts(identified.calibration) | {"calibration": str(args.out)}
+    facts = calibration_facts(identified.calibration)
+    # A rejected calibration never takes the place of a good one.
+    rejected = args.out.parent / f"{args.out.stem}.rejected.json"
+    path = rejected if facts["verdict"] == REJECTED else args.out
+    save_calibration(path, identified.calibration)
+    facts["calibration"] = str(path)
     if args.report is not None:
         # Drawing takes a second to import; most commands do without.
         from omsm_ros.jobs.certify import write_certificate
@@ -66,6 +76,12 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "static_gain": calibration.static_gain,
         "valid_up_to": calibration.valid_up_to,
     }
+
+
+def _not_identified(facts: Facts) -> str:
+    if facts["verdict"] != REJECTED:
+        return ""
+    return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {facts['calibration']!r}"
 
 
 def _show_identify(facts: Facts) -> None:
@@ -166,12 +182,15 @@ def _repeatability_facts(found: Repeatability) -> Facts:
 def _declare_plan(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("what", choices=("steps",))
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument("--sample-period", type=positive, default=1e-3, help="of the probe [s]")
-    sub.add_argument("--step", type=positive, default=9.8e-6, help="height of a step [m]")
-    sub.add_argument("--count", type=int, default=10, help="steps up; as many follow down")
-    sub.add_argument("--dwell", type=positive, default=0.5, help="from edge to edge [s]")
-    sub.add_argument("--rise", type=positive, default=20e-3, help="of an edge [s]")
-    sub.add_argument("--half-range", type=positive, default=50e-6, help="of the probe [m]")
+    for name, quantity, default, meaning in (
+        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "of the probe [s]"),
+        ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
+        ("--count", quantities.COUNT, 10, "steps up; as many follow down"),
+        ("--dwell", quantities.DWELL, 0.5, "from edge to edge [s]"),
+        ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
+        ("--half-range", quantities.STEP, 50e-6, "of the probe [m]"),
+    ):
+        sub.add_argument(name, type=number(quantity), default=default, help=meaning)
 
 
 def _plan(args: argparse.Namespace) -> Facts:
@@ -208,7 +227,12 @@ def _show_plan(facts: Facts) -> None:
 COMMANDS = (
     Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
     Command(
-        "identify", "identify G_m from a recording", _declare_identify, _identify, _show_identify
+        "identify",
+        "identify G_m from a recording",
+        _declare_identify,
+        _identify,
+        _show_identify,
+        _not_identified,
     ),
     Command(
         "verify",

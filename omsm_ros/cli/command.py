@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +22,7 @@ class Command:
 
     declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
     show: prints the facts for people
+    refusal: why the facts, although told, are not a success; empty if they are one
     """
 
     name: str
@@ -31,6 +30,7 @@ class Command:
     declare: Callable[[argparse.ArgumentParser], None]
     act: Callable[[argparse.Namespace], Facts]
     show: Callable[[Facts], None]
+    refusal: Callable[[Facts], str] = lambda facts: ""
 
 
 @contextmanager
@@ -44,25 +44,6 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Progress]:
             bar.update(done - bar.n)
 
         yield advance
-
-
-def json_object(text: str) -> dict[str, object]:
-    """Argument type: a JSON object."""
-    try:
-        value = json.loads(text)
-    except ValueError as err:
-        raise argparse.ArgumentTypeError(f"{text!r} is not JSON: {err}") from err
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
-    return value
-
-
-def positive(text: str) -> float:
-    """Argument type: a positive number."""
-    value = float(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
 
 
 def table(rows: list[tuple[str, str]]) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
+import io
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from omsm_ros import __version__
-from omsm_ros.cli.command import Command, positive
-from omsm_ros.errors import OmsmError
+from omsm_ros import __version__, quantities
+from omsm_ros.cli.arguments import OneLineParser, number
+from omsm_ros.cli.command import Command
+from omsm_ros.errors import DEBUG, OmsmError, defect
+from omsm_ros.storage import strict_json
 
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
 
 # A correction takes a quarter of a second; loading what identifies would take twice that.
 WORDS = {
@@ -31,7 +34,7 @@ def _commands(word: str) -> list[Command]:
 
 
 def _parser(word: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="omsm", description="Identify, correct and judge recorded measurements."
     )
     parser.add_argument("--version", action="version", version=__version__)
@@ -44,8 +47,9 @@ def _parser(word: str) -> argparse.ArgumentParser:
     demo = words.add_parser("demo", help="calibrate and measure on the digital twin (needs ROS)")
     demo.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
-    demo.add_argument("--time-lapse", type=positive, default=20.0, help="times faster than real")
-    demo.add_argument("--seed", type=int, default=1, help="of the twin's noise")
+    lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
+    demo.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
+    demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
     return parser
 
 
@@ -59,19 +63,41 @@ def _demo(args: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    args = _parser(given[0] if given else "").parse_args(given)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
     try:
-        if args.command == "demo":
-            return _demo(args)
-        facts = args.run.act(args)
-        if args.json:
-            print(json.dumps(facts))
-        else:
-            args.run.show(facts)
+        return _run(_parser(given[0] if given else "").parse_args(given))
     except OmsmError as err:
-        print(f"omsm: {err}", file=sys.stderr)
+        _say(str(err))
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("omsm: interrupted; no unfinished file was left", file=sys.stderr)
+        _say("interrupted; no unfinished file was left")
         return INTERRUPTED
+    except BrokenPipeError:
+        # Who read our output has enough of it; nothing more may be flushed to it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as err:
+        if os.environ.get(DEBUG):
+            raise
+        _say(defect(err))
+        return DEFECT
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.command == "demo":
+        return _demo(args)
+    facts = args.run.act(args)
+    if args.json:
+        print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
+    else:
+        args.run.show(facts)
+    if refusal := args.run.refusal(facts):
+        _say(refusal)
+        return BAD_INPUT
     return DONE
+
+
+def _say(text: str) -> None:
+    print("omsm:", " ".join(text.split()), file=sys.stderr)

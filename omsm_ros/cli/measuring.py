@@ -6,7 +6,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.correction.uncertainty import sources_with
@@ -16,8 +18,10 @@ from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.read_bag import motion_in
 from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
 from omsm_ros.storage.machine_files import load_geometry, load_surface
 from omsm_ros.storage.motion_file import load_motion
+from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
@@ -59,7 +63,9 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
-    sub.add_argument("--lateral-lag", type=float, help="of the probe against X and C [s]")
+    sub.add_argument(
+        "--lateral-lag", type=number(quantities.LAG), help="of the probe against X and C [s]"
+    )
     sub.add_argument(
         "--sources",
         type=json_object,
@@ -68,16 +74,24 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
         help='other standard uncertainties, e.g. {"encoder_noise": 4e-10}',
     )
     sub.add_argument(
-        "--lateral", type=positive, default=0.0, help="standard uncertainty of x and y [m]"
+        "--lateral",
+        type=number(quantities.UNCERTAINTY),
+        default=0.0,
+        help="standard uncertainty of x and y [m]",
     )
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
     sub.add_argument(
         "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
     )
     sub.add_argument(
-        "--delay", type=float, default=0.0, help="from the probe's stamp to its exposure [s]"
+        "--delay",
+        type=number(quantities.STAMP_DELAY),
+        default=0.0,
+        help="from the probe's stamp to its exposure [s]",
     )
-    sub.add_argument("--exposure", type=float, default=0.0, help="of the probe [s]")
+    sub.add_argument(
+        "--exposure", type=number(quantities.EXPOSURE), default=0.0, help="of the probe [s]"
+    )
     sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
     sub.add_argument(
@@ -95,11 +109,14 @@ def _correct(args: argparse.Namespace) -> Facts:
         geometry=geometry_of(args.geometry),
         sources=sources_with(calibration, args.sources),
     )
-    with progress_bar("correcting", args.json) as progress:
+    with (
+        result_folder(args.out, (CLOUD, REPORT, SUMMARY)) as out,
+        progress_bar("correcting", args.json) as progress,
+    ):
         return measure(
             args.bag,
             calibration,
-            args.out,
+            out,
             nominal=nominal,
             options=options,
             admission=Admission(args.settings, args.override),
@@ -127,7 +144,10 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("motion", type=Path, help="a bag, or a planned motion as CSV time_s,z_m")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument(
-        "--budget", type=positive, default=DEFAULT_BUDGET_M, help="allowed residual, k = 2 [m]"
+        "--budget",
+        type=number(quantities.BUDGET),
+        default=DEFAULT_BUDGET_M,
+        help="allowed residual, k = 2 [m]",
     )
 
 

@@ -10,7 +10,8 @@ from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
 from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
-from omsm_ros.storage.files import whole_file
+from omsm_ros.storage.files import save_bytes
+from omsm_ros.storage.result_folder import result_folder
 
 PAGE, MARKDOWN = "certificate.html", "certificate.md"
 
@@ -31,7 +32,7 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     files = {picture_name(name): picture for name, picture in certificate.figures.items()}
     files[MARKDOWN] = render_markdown(certificate).encode("utf-8", "replace")
     files[PAGE] = render(certificate).encode("utf-8", "replace")
-    for name, content in files.items():
-        with whole_file(out / name) as stream:
-            stream.write(content)
+    with result_folder(out, (MARKDOWN, PAGE)) as folder:
+        for name, content in files.items():
+            save_bytes(folder / name, content)
     return out / PAGE

@@ -103,10 +103,15 @@ def _new_file(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
 
 
+def save_bytes(path: Path | str, content: bytes) -> None:
+    """Write a file."""
+    with whole_file(path) as stream:
+        stream.write(content)
+
+
 def save_text(path: Path | str, text: str) -> None:
     """Write a text file."""
-    with whole_file(path) as stream:
-        stream.write(text.encode("utf-8", "replace"))
+    save_bytes(path, text.encode("utf-8", "replace"))
 
 
 def save_json(path: Path | str, content: Mapping[str, object]) -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -137,3 +138,79 @@ def test_every_word_is_where_main_looks_for_it():
 
     for module, words in WORDS.items():
         assert tuple(c.name for c in importlib.import_module(module).COMMANDS) == words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "command"),
+        (["frob"], "'frob'"),
+        (["identify"], "--out"),
+        (["inspect", "a", "b"], "b"),
+        (["identify", "a", "--out", "b", "--order", "9" * 400], "order"),
+        (["identify", "a", "--out", "b", "--duration", "nan"], "duration"),
+        (["align", "a", "--calibration", "b", "--out", "c", "--radius", "0"], "radius"),
+        (["predict", "a", "--calibration", "b", "--budget", "1e300"], "allowed residual"),
+        (["correct", "a", "--calibration", "b", "--out", "c", "--settings", '{"a": NaN}'], "NaN"),
+        (["correct", "a", "--calibration", "b", "--out", "c", "--settings", "[" * 9999], "nested"),
+        (["plan", "steps", "--out", "a", "--count", "100000", "--step", "1e-10"], "fewer steps"),
+        (["demo", "--seed", "1e99"], "seed"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_with_a_remedy(capsys, arguments, named):
+    assert cli.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert named in err
+    assert len(err) < 600
+
+
+def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_path, step_test):
+    """A target that moves by itself: the residual is far above the noise at rest."""
+    import numpy as np
+
+    wobble = 2e-6 * np.sin(0.37 * np.arange(len(step_test.axes)))
+    path, good = tmp_path / "steps.mcap", tmp_path / "cal.json"
+    good.write_text("precious")
+    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in blocks_of(step_test):
+            at = slice(distance.first_sample, distance.first_sample + len(distance))
+            moving = np.abs(np.gradient(axes.z)).max() > 1e-9
+            bag.write_axes(axes)
+            shaken = distance.distance + (wobble[at] if moving else 0.0)
+            bag.write_distance(dataclasses.replace(distance, distance=shaken))
+    status, text, err = run(capsys, "identify", path, "--out", good, "--order", 2, "--json")
+    facts = json.loads(text)
+    assert (status, facts["verdict"]) == (2, "rejected")
+    assert err.count("\n") == 1
+    assert facts["reasons"][0] in err
+    assert good.read_text() == "precious"
+    kept = json.loads((tmp_path / "cal.rejected.json").read_text())
+    assert kept["certificate"]["verdict"] == "rejected"
+
+
+def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypatch, folder):
+    from omsm_ros.cli import measuring
+
+    def broken(*_):
+        raise AttributeError("'NoneType' object has no\nattribute 'z'")
+
+    monkeypatch.setattr(measuring, "inspect_bag", broken)
+    status, out, err = run(capsys, "inspect", folder / "scan.mcap", "--json")
+    assert (status, out) == (70, "")
+    assert err.count("\n") == 1
+    assert "AttributeError: 'NoneType' object has no attribute 'z' in broken" in err
+    assert "report" in err
+    monkeypatch.setenv("OMSM_DEBUG", "1")
+    with pytest.raises(AttributeError):
+        cli.main(["inspect", str(folder / "scan.mcap")])
+
+
+def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
+    from omsm_ros.cli import measuring
+
+    monkeypatch.setattr(measuring, "as_json", lambda _: [{"a": float("nan"), "b": [float("inf")]}])
+    status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
+    assert status == 0
+    assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

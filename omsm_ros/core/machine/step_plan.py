@@ -19,6 +19,8 @@ from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M
 _GOLDEN = 0.6180339887498949
 # An S-curve of this many samples has nothing worth naming beyond half the rate.
 _LEAST_RISE_SAMPLES = 10
+# A quarter of an hour at 1 kHz, thirty megabytes.
+_MOST_LINES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +64,6 @@ def plan_steps(
 
     Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
     """
-    if count < 1 or not step > 0 or not sample_period > 0:
-        raise ConfigurationError(
-            f"step plan: count {count!r}, step {step!r} m and sample_period {sample_period!r} s "
-            "must be positive"
-        )
     if rise < _LEAST_RISE_SAMPLES * sample_period:
         raise ConfigurationError(
             f"step plan: rise {rise!r} s is too sharp for samples every {sample_period!r} s; "
@@ -93,7 +90,15 @@ def plan_steps(
 
 
 def plan_csv(plan: StepPlan, period: float) -> str:
-    """``time_s,z_m`` lines every ``period`` [s], a header first."""
+    """``time_s,z_m`` lines every ``period`` [s], a header first.
+
+    Raises ConfigurationError for more lines than a controller takes.
+    """
+    if plan.duration > _MOST_LINES * period:
+        raise ConfigurationError(
+            f"step plan: {plan.duration:g} s every {period:g} s are {plan.duration / period:.3g} "
+            f"lines, at most {_MOST_LINES}; plan fewer steps or shorter rests"
+        )
     time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
     rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]
     return "\n".join(["time_s,z_m", *rows]) + "\n"

@@ -1,0 +1,69 @@
+"""Results that belong together are put in place together: all of one run, or none of it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import beside, said
+
+
+@contextmanager
+def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty private folder; put its files into ``path`` at once when all went well.
+
+    names: of the files that make a result; those of an earlier run go. The last of them says
+        that the result is whole: it is taken away first and comes last, so that nobody ever
+        sees it beside files of another run. Other files in ``path`` stay.
+
+    FileError if it cannot be written there; then, as after any exception, ``path`` is unchanged.
+    """
+    target = Path(os.path.abspath(path))
+    staged: Path | None = None
+    try:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists() and not target.is_dir():
+                raise NotADirectoryError(None, "it is a file; give a folder")
+            staged = beside(target)
+            staged.mkdir()
+        except (OSError, ValueError) as err:
+            raise _refusal(path, err) from err
+        yield staged
+        try:
+            _put_in_place(staged, target, names)
+        except (OSError, ValueError) as err:
+            raise _refusal(path, err) from err
+    finally:
+        if staged is not None:
+            shutil.rmtree(staged, ignore_errors=True)
+
+
+def _refusal(path: Path | str, err: Exception) -> FileError:
+    return FileError(
+        f"cannot write results into {str(path)!r}: {said(err)}; check the folder, its rights and "
+        "its room"
+    )
+
+
+def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
+    if not target.exists():
+        staged.rename(target)
+        return
+    for part in staged.iterdir():
+        if (target / part.name).is_dir():
+            raise IsADirectoryError(None, f"{part.name!r} there is a folder; remove it")
+    lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one writer after the other
+        for name in reversed(names):
+            (target / name).unlink(missing_ok=True)
+        for part in sorted(staged.iterdir(), key=lambda part: part.name == names[-1]):
+            part.replace(target / part.name)
+    finally:
+        os.close(lock)

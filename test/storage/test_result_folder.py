@@ -1,0 +1,90 @@
+"""Results of one run never stand beside those of another."""
+
+import os
+import threading
+
+import pytest
+
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import save_text, whole_file
+from omsm_ros.storage.result_folder import result_folder
+
+NAMES = ("cloud", "report", "summary")
+
+
+def put(path, text, names=NAMES):
+    with result_folder(path, NAMES) as folder:
+        for name in names:
+            save_text(folder / name, text)
+
+
+def broken(path, error):
+    with result_folder(path, NAMES) as folder:
+        save_text(folder / "cloud", "half")
+        raise error
+
+
+def held(path):
+    return {part.name: part.read_text() for part in path.iterdir()}
+
+
+def test_a_new_folder_appears_whole_or_not_at_all(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        broken(tmp_path / "out", KeyboardInterrupt())
+    assert list(tmp_path.iterdir()) == []
+    put(tmp_path / "out", "1")
+    assert held(tmp_path / "out") == dict.fromkeys(NAMES, "1")
+    assert [part.name for part in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_second_run_replaces_all_of_the_first_and_nothing_else(tmp_path):
+    put(tmp_path / "out", "1")
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    put(tmp_path / "out", "2", ("cloud", "summary"))
+    assert held(tmp_path / "out") == {"cloud": "2", "summary": "2", "notes.txt": "mine"}
+
+
+def test_a_refused_run_leaves_the_first_as_it_was(tmp_path):
+    put(tmp_path / "out", "1")
+    with pytest.raises(ValueError, match="no"):
+        broken(tmp_path / "out", ValueError("no"))
+    assert held(tmp_path / "out") == dict.fromkeys(NAMES, "1")
+
+
+def test_two_writers_do_not_mix(tmp_path):
+    def many(text):
+        for _ in range(30):
+            put(tmp_path / "out", text)
+
+    writers = [threading.Thread(target=many, args=(text,)) for text in "ab"]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert len(set(held(tmp_path / "out").values())) == 1
+    assert [part.name for part in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("name", ["file", "file/below", "n" * 300, "\0"])
+def test_what_can_be_no_folder_is_refused_by_name(tmp_path, name):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(FileError, match="cannot write results into"):
+        put(tmp_path / name, "1")
+    assert held(tmp_path) == {"file": "mine"}
+
+
+def test_a_link_laid_for_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
+    """Even a name that was foreseen opens nothing that exists."""
+    monkeypatch.setattr("secrets.token_hex", lambda _: "foreseen")
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / ".foreseen.part").symlink_to(victim)
+    with pytest.raises(FileError, match="File exists"), whole_file(tmp_path / "a"):
+        pass
+    assert victim.read_text() == "precious"
+
+
+def test_temporary_names_differ(tmp_path):
+    with whole_file(tmp_path / "a") as one, whole_file(tmp_path / "a") as other:
+        assert one.name != other.name
+    assert os.listdir(tmp_path) == ["a"]
