@@ -19,6 +19,7 @@ class OneLineParser(argparse.ArgumentParser):
     """Refuses in one line instead of repeating how it is used."""
 
     def error(self, message: str) -> NoReturn:
+        """Raise UsageError instead of printing and exiting."""
         raise UsageError(f"{message}; see '{self.prog} --help'")
 
 
