@@ -9,9 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from tqdm import tqdm
-
-from omsm_ros.jobs.read_bag import Progress
+from omsm_ros.jobs.read_bag import Progress, no_progress
 
 Facts: TypeAlias = "dict[str, Any]"
 
@@ -36,8 +34,13 @@ class Command:
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[Progress]:
     """A bar on stderr that counts messages; silent for programs and in pipes."""
-    hidden = quiet or not sys.stderr.isatty()
-    with tqdm(desc=title, unit=" messages", leave=False, disable=hidden) as bar:
+    if quiet or not sys.stderr.isatty():
+        yield no_progress
+        return
+    # Here, because most commands run for programs, and nobody would see it.
+    from tqdm import tqdm
+
+    with tqdm(desc=title, unit=" messages", leave=False) as bar:
 
         def advance(done: int, total: int) -> None:
             bar.total = total

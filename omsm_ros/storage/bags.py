@@ -13,18 +13,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
 
-import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError, CalibrationError, DataError
@@ -38,8 +33,8 @@ from omsm_ros.storage.bag_checks import (
     unpacked_message,
 )
 from omsm_ros.storage.block_table import long_blocks
-from omsm_ros.storage.conversions import Messages
 from omsm_ros.storage.files import said
+from omsm_ros.storage.message_types import bag_messages, typestore
 
 AXES_TOPIC = "/omsm/axes"
 DISTANCE_TOPIC = "/omsm/confocal"
@@ -79,44 +74,6 @@ _BLOCKS: dict[str, type] = {
 _JOINED_BYTES = 1_000_000
 
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
-
-
-@lru_cache(maxsize=1)
-def typestore() -> Typestore:
-    """Types of ROS 2 Jazzy and of omsm_msgs, from the same ``.msg`` texts ROS builds from."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = {}
-    for text in sorted(_message_folder().glob("*.msg")):
-        types.update(get_types_from_msg(text.read_text(), f"omsm_msgs/msg/{text.stem}"))
-    store.register(types)
-    return store
-
-
-def _message_folder() -> Path:
-    package = Path(__file__).resolve().parents[1]
-    # Installed beside the code, or in a source checkout next to the package.
-    installed = package / "interfaces" / "msg"
-    return installed if installed.is_dir() else package.parent / "msg_defs" / "msg"
-
-
-@lru_cache(maxsize=1)
-def bag_messages() -> Messages:
-    """Message classes for writing bags without ROS."""
-    names = {
-        "AxisBlock": "omsm_msgs/msg/AxisBlock",
-        "DistanceBlock": "omsm_msgs/msg/DistanceBlock",
-        "Calibration": "omsm_msgs/msg/Calibration",
-        "Header": "std_msgs/msg/Header",
-        "Time": "builtin_interfaces/msg/Time",
-        "PointCloud2": "sensor_msgs/msg/PointCloud2",
-        "PointField": "sensor_msgs/msg/PointField",
-    }
-    types = typestore().types
-    return Messages({short: types[name] for short, name in names.items()}, _bag_sequence)
-
-
-def _bag_sequence(values: ArrayLike, dtype: DTypeLike) -> Any:
-    return np.ascontiguousarray(values, dtype)
 
 
 # ------------------------------------------------------------------------------ reading

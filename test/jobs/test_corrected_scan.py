@@ -14,7 +14,7 @@ from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.jobs import corrected_scan
 from omsm_ros.jobs.correct_bag import correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
-from omsm_ros.storage import bags
+from omsm_ros.storage import bags, conversions, message_types
 from omsm_ros.storage.cloud_file import CloudFile
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
@@ -26,12 +26,12 @@ def write(path, blocks, ahead=0):
         for k in range(len(blocks) + ahead):
             # At the time of its writing, which a reader goes by, not at its own.
             stamp = k * 100_000_000
-            messages = bags.bag_messages()
+            messages = message_types.bag_messages()
             if k < len(blocks):
-                message = bags.conversions.axis_message(messages, blocks[k][0])
+                message = conversions.axis_message(messages, blocks[k][0])
                 bag.write(bags.AXES_TOPIC, stamp, message)
             if k >= ahead:
-                message = bags.conversions.distance_message(messages, blocks[k - ahead][1])
+                message = conversions.distance_message(messages, blocks[k - ahead][1])
                 bag.write(bags.DISTANCE_TOPIC, stamp, message)
     return path
 

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omsm_ros.errors import BagError
-from omsm_ros.storage import bag_checks, bags, conversions
+from omsm_ros.storage import bag_checks, bags, conversions, message_types
 
 AXES = bags.TOPIC_TYPES[bags.AXES_TOPIC]
 
@@ -22,7 +22,7 @@ def records(path, *topics):
 
 @pytest.fixture
 def message(small_scan_blocks):
-    return conversions.axis_message(bags.bag_messages(), small_scan_blocks[0][0])
+    return conversions.axis_message(message_types.bag_messages(), small_scan_blocks[0][0])
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def written(tmp_path, small_scan_blocks):
 
 def foreign_bag(folder, messages, *, plugin=StoragePlugin.MCAP, store=None, mode=None):
     """A bag as another program writes it; the path of its MCAP file or its folder."""
-    store = store or bags.typestore()
+    store = store or message_types.typestore()
     writer = Writer(folder, version=9, storage_plugin=plugin)
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
@@ -51,7 +51,7 @@ def foreign_bag(folder, messages, *, plugin=StoragePlugin.MCAP, store=None, mode
 def swapped_store():
     """Types in which x and z of an AxisBlock have changed places."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    text = (bags._message_folder() / "AxisBlock.msg").read_text()
+    text = (message_types.message_folder() / "AxisBlock.msg").read_text()
     lines = text.splitlines()
     x, z = (next(i for i, line in enumerate(lines) if f"float64[] {n}" in line) for n in "xz")
     lines[x], lines[z] = lines[z], lines[x]
@@ -69,7 +69,7 @@ def test_another_order_of_the_fields_is_refused(tmp_path, message, plugin):
 
 
 def test_comments_in_a_definition_are_no_other_definition(tmp_path, message):
-    text = (bags._message_folder() / "AxisBlock.msg").read_text()
+    text = (message_types.message_folder() / "AxisBlock.msg").read_text()
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg("# another comment\n" + text, AXES))
     other = store.types[AXES](**{f: getattr(message, f) for f in message.__dataclass_fields__})
@@ -79,9 +79,9 @@ def test_comments_in_a_definition_are_no_other_definition(tmp_path, message):
 def test_all_channels_of_a_topic_are_read(tmp_path, small_scan_blocks):
     """rosbags writes one channel a topic; a second recorder's is made of it by hand."""
     blocks = [axes for axes, _ in small_scan_blocks[:10]]
-    messages = [conversions.axis_message(bags.bag_messages(), block) for block in blocks]
+    messages = [conversions.axis_message(message_types.bag_messages(), block) for block in blocks]
     folder = tmp_path / "two"
-    store = bags.typestore()
+    store = message_types.typestore()
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         first = writer.add_connection(bags.AXES_TOPIC, AXES, typestore=store)
         second = writer.add_connection("/omsm/axez", AXES, typestore=store)

@@ -4,7 +4,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
-from omsm_ros.storage import bags, conversions
+from omsm_ros.storage import bags, conversions, message_types
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
@@ -38,10 +38,10 @@ def test_folders_of_rosbag2_are_read(tmp_path, small_scan_blocks, plugin):
     folder = tmp_path / "recorded"
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         connection = writer.add_connection(
-            bags.AXES_TOPIC, bags.TOPIC_TYPES[bags.AXES_TOPIC], typestore=bags.typestore()
+            bags.AXES_TOPIC, bags.TOPIC_TYPES[bags.AXES_TOPIC], typestore=message_types.typestore()
         )
-        message = conversions.axis_message(bags.bag_messages(), small_scan_blocks[0][0])
-        raw = bags.typestore().serialize_cdr(message, bags.TOPIC_TYPES[bags.AXES_TOPIC])
+        message = conversions.axis_message(message_types.bag_messages(), small_scan_blocks[0][0])
+        raw = message_types.typestore().serialize_cdr(message, bags.TOPIC_TYPES[bags.AXES_TOPIC])
         writer.write(connection, 5, raw)
     with bags.BagReader(folder) as reader:
         ((_, block),) = reader.records(bags.AXES_TOPIC)
@@ -89,14 +89,16 @@ def test_damaged_bytes_are_refused_or_harmless(tmp_path, bag):
 def test_a_topic_of_another_type_is_refused(tmp_path):
     path = tmp_path / "text"
     with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        writer.add_connection(bags.AXES_TOPIC, "std_msgs/msg/String", typestore=bags.typestore())
+        writer.add_connection(
+            bags.AXES_TOPIC, "std_msgs/msg/String", typestore=message_types.typestore()
+        )
     with pytest.raises(BagError, match="std_msgs/msg/String"):
         _open(path, bags.AXES_TOPIC)
 
 
 def test_a_block_that_contradicts_itself_is_refused(tmp_path, small_scan_blocks):
     path = tmp_path / "odd.mcap"
-    message = conversions.axis_message(bags.bag_messages(), small_scan_blocks[0][0])
+    message = conversions.axis_message(message_types.bag_messages(), small_scan_blocks[0][0])
     message.x = message.x[:3]
     with bags.BagWriter(path, TOPICS) as writer:
         writer.write(bags.AXES_TOPIC, 0, message)
@@ -116,7 +118,7 @@ def test_an_interrupted_recording_leaves_no_file(tmp_path, small_scan_blocks):
 
 
 def test_calibration_survives_the_message(true_calibration):
-    message = conversions.calibration_message(bags.bag_messages(), true_calibration, 7)
+    message = conversions.calibration_message(message_types.bag_messages(), true_calibration, 7)
     assert conversions.calibration(message).id == true_calibration.id
     message.static_gain = 1.0
     with pytest.raises(conversions.CalibrationError, match="altered"):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import BagError, DataError
-from omsm_ros.storage import bags, conversions
+from omsm_ros.storage import bags, conversions, message_types
 from omsm_ros.storage.block_table import long_blocks
 
 RANDOM = np.random.default_rng(7)
@@ -40,12 +40,12 @@ def distance(first: int, samples: int, optional: str = "both") -> DistanceBlock:
 
 def serialised(block: Block, frame: str = "machine") -> bytes:
     if isinstance(block, AxisBlock):
-        message = conversions.axis_message(bags.bag_messages(), block, frame)
+        message = conversions.axis_message(message_types.bag_messages(), block, frame)
         kind = "AxisBlock"
     else:
-        message = conversions.distance_message(bags.bag_messages(), block, frame)
+        message = conversions.distance_message(message_types.bag_messages(), block, frame)
         kind = "DistanceBlock"
-    return bytes(bags.typestore().serialize_cdr(message, f"omsm_msgs/msg/{kind}"))
+    return bytes(message_types.typestore().serialize_cdr(message, f"omsm_msgs/msg/{kind}"))
 
 
 def joined(blocks: Sequence[Block]) -> dict[str, np.ndarray]:
@@ -149,7 +149,7 @@ def test_a_bag_gives_the_same_samples_either_way(tmp_path) -> None:
 
 def test_a_block_without_samples_is_a_damaged_bag(tmp_path) -> None:
     path = tmp_path / "empty.mcap"
-    message = conversions.axis_message(bags.bag_messages(), axes(0, 1))
+    message = conversions.axis_message(message_types.bag_messages(), axes(0, 1))
     for name in "xyzbc":
         setattr(message, name, np.empty(0))
     with bags.BagWriter(path, (bags.AXES_TOPIC,)) as bag:

@@ -20,7 +20,7 @@ from omsm_ros.core.dynamics.second_order_sections import bilinear_roots, second_
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.sosfilt import sosfilt
+from omsm_ros.scipy_parts import sosfilt
 
 DEFAULT_ORDER = 3
 # Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.

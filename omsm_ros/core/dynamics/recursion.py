@@ -13,7 +13,7 @@ import numpy as np
 
 from omsm_ros.core.dynamics.discretisation import DigitalFilter
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.sosfilt import sosfilt
+from omsm_ros.scipy_parts import sosfilt
 
 # Position, velocity, acceleration.
 POLYNOMIAL_DEGREE = 2
