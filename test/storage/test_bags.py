@@ -90,9 +90,9 @@ def test_a_topic_of_another_type_is_refused(tmp_path):
     path = tmp_path / "text"
     with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         writer.add_connection(
-            bags.AXES_TOPIC, "std_msgs/msg/String", typestore=message_types.typestore()
+            bags.AXES_TOPIC, "std_msgs/msg/Header", typestore=message_types.typestore()
         )
-    with pytest.raises(BagError, match="std_msgs/msg/String"):
+    with pytest.raises(BagError, match="std_msgs/msg/Header"):
         _open(path, bags.AXES_TOPIC)
 
 
