@@ -21,7 +21,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 setup: $(PACKAGE)
 
 demo: setup
-	$(RUN) omsm demo --out out/demo
+	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE))
 
 test: lint
 	$(RUN) python -m pytest

@@ -50,7 +50,7 @@ ONLY_IN = {
     "builtin_interfaces": {"nodes", "storage.conversions"},
     "rcl_interfaces": {"nodes"},
     "serial": {"devices.transport"},
-    "socket": {"devices.transport"},
+    "socket": {"devices.transport", "emulators.tcp_server"},
     "rosbags": {"storage"},
     "matplotlib": {"report"},
 }

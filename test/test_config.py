@@ -10,6 +10,7 @@ import yaml
 import omsm_ros
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.devices.factory import PARAMETERS
 from omsm_ros.storage.machine_files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
@@ -24,6 +25,8 @@ def _declared(node):
             name = call.args[1]
             if isinstance(name, ast.Constant):
                 yield name.value
+            elif isinstance(name, ast.Attribute):  # a table's
+                yield from (entry.name for entry in PARAMETERS)
             elif isinstance(name.values[0], ast.Constant):  # f"geometry.{name}"
                 group = {"geometry.": Geometry, "sources.": ErrorSources}[name.values[0].value]
                 yield from (f"{name.values[0].value}{field.name}" for field in fields(group))

@@ -49,6 +49,7 @@ def _parser(word: str) -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
     demo.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
+    demo.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
     demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
     return parser
 
@@ -57,6 +58,7 @@ def _demo(args: argparse.Namespace) -> int:
     # The demonstration runs real nodes, so it is one; ROS is imported only there.
     command = [sys.executable, "-m", "omsm_ros.nodes.cell_demo_node", "--out", str(args.out)]
     command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]
+    command += ["--device", args.device]
     return subprocess.call([*command, *(["--json"] if args.json else [])])
 
 

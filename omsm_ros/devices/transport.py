@@ -17,6 +17,7 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 DEFAULT_BAUD_RATE = 921_600
 _CHUNK_BYTES = 65_536
 _TCP_SCHEME = "tcp://"
+_SERIAL_SCHEME = "serial://"
 
 
 class Transport(Protocol):
@@ -44,7 +45,7 @@ class Transport(Protocol):
 
 
 class SerialTransport:
-    """A serial port 8N1, real or pseudo-terminal, held exclusively.
+    """A serial port 8N1, real or pseudo-terminal, held exclusively, or any URL of pyserial.
 
     Opening discards what the port received before.
     """
@@ -53,16 +54,19 @@ class SerialTransport:
         if not baud_rate > 0:
             raise ConfigurationError(f"baud_rate {baud_rate!r}, expected a positive number")
         self.name = port
-        self._baud_rate = baud_rate
+        self.baud_rate = baud_rate
         self._port: serial.Serial | None = None
 
     def open(self) -> None:
         self.close()
         try:
-            self._port = serial.Serial(self.name, self._baud_rate, exclusive=True)
+            if "://" in self.name:
+                self._port = serial.serial_for_url(self.name, self.baud_rate)
+            else:
+                self._port = serial.Serial(self.name, self.baud_rate, exclusive=True)
         except (OSError, ValueError, termios.error) as err:
             raise DeviceError(
-                f"cannot open serial port {self.name!r} at {self._baud_rate!r} baud: {err}; check "
+                f"cannot open serial port {self.name!r} at {self.baud_rate!r} baud: {err}; check "
                 "the cable, the port's name, membership of group dialout, and that no other "
                 "program holds it"
             ) from err
@@ -162,10 +166,24 @@ class TcpTransport:
 
 
 def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport:
-    """The transport that ``address`` names: ``tcp://host:port``, or the path of a serial port."""
-    if not address.startswith(_TCP_SCHEME):
-        return SerialTransport(address, baud_rate)
-    host, _, port = address[len(_TCP_SCHEME) :].rpartition(":")
-    if not (host and port.isdecimal()):
-        raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
-    return TcpTransport(host.strip("[]"), int(port))
+    """The transport that ``address`` names.
+
+    ``tcp://host:port``; ``serial:///dev/ttyUSB0?baud=921600`` or the path of a serial port
+    (``baud_rate`` where the address has none); any URL that pyserial knows
+    (``rfc2217://host:port``). Raises ConfigurationError.
+    """
+    if address.startswith(_TCP_SCHEME):
+        host, _, port = address[len(_TCP_SCHEME) :].rpartition(":")
+        if not (host and port.isdecimal()):
+            raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
+        return TcpTransport(host.strip("[]"), int(port))
+    if address.startswith(_SERIAL_SCHEME):
+        path, _, query = address[len(_SERIAL_SCHEME) :].partition("?")
+        name, _, value = query.partition("=")
+        if not path or (query and (name != "baud" or not value.isdecimal())):
+            raise ConfigurationError(
+                f"address {address!r}, expected serial:///dev/ttyUSB0 or "
+                "serial:///dev/ttyUSB0?baud=921600"
+            )
+        return SerialTransport(path, int(value) if value else baud_rate)
+    return SerialTransport(address, baud_rate)

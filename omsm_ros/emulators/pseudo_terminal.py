@@ -14,6 +14,7 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 
 # How often a wait looks at its stop event.
 _LOOK_S = 0.05
+_CHUNK_BYTES = 65_536
 
 
 class Pty:
@@ -33,6 +34,11 @@ class Pty:
         self._slave_name = ""
 
     def __enter__(self) -> Pty:
+        self.plug()
+        return self
+
+    def plug(self) -> None:
+        """Offer the port, under the same link as before."""
         self._master, slave = os.openpty()
         try:
             tty.setraw(slave)
@@ -49,7 +55,6 @@ class Pty:
         except ConfigurationError:
             self.close()
             raise
-        return self
 
     def __exit__(
         self,
@@ -66,6 +71,10 @@ class Pty:
         if self._master is not None:
             os.close(self._master)
             self._master = None
+
+    def unplug(self) -> None:
+        """Take the port away, as a cable that is pulled."""
+        self.close()
 
     @property
     def path(self) -> str:
@@ -85,6 +94,13 @@ class Pty:
             if time.monotonic() > deadline or stop.wait(_LOOK_S):
                 return False
         return True
+
+    def read(self) -> bytes:
+        """What the driver sent; b"" if nothing."""
+        try:
+            return os.read(self._descriptor(), _CHUNK_BYTES)
+        except OSError:  # nothing there, or no driver
+            return b""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
         """Bytes of ``data`` a driver can get: fewer without one, or when ``stop`` is set."""

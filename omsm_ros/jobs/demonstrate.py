@@ -19,6 +19,7 @@ from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.surface import deviation as form
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.emulators.players import emulated
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs import measure as measurement
 from omsm_ros.jobs import publish as publication
@@ -40,6 +41,8 @@ from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 # The step test begins at rest.
 _REST_SAMPLES = 100
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
+# Where an emulated device has to be on TCP: one of these ports of this machine.
+_FIRST_PORT, _PORTS = 20_000, 10_000
 TITLE = "Paraboloid mirror measured on the emulated cell"
 
 
@@ -48,12 +51,14 @@ class Demonstration:
     """Where the results go, and how the twin is set.
 
     time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
+    device: what the emulated probe speaks
     """
 
     out: Path
     seed: int = 1
     time_lapse: float = 20.0
     start_radius: float = 12.7e-3
+    device: str = "six_channel"
     sample_period: float = field(default=1e-3, init=False)
 
     @cached_property
@@ -75,7 +80,9 @@ class Demonstration:
 
     @property
     def link(self) -> str:
-        """The emulated serial port."""
+        """The emulated port."""
+        if emulated(self.device).tcp:
+            return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
         return str((self.out / "cell").absolute())
 
     @property
@@ -91,11 +98,17 @@ class Demonstration:
     def emulator_parameters(self) -> dict[str, object]:
         """ROS parameters of the emulator."""
         return {
+            "device": self.device,
             "time_lapse": self.time_lapse,
             "seed": self.seed,
             "start_radius": self.start_radius,
             "sample_period": self.sample_period,
         }
+
+    def driver_parameters(self) -> dict[str, object]:
+        """ROS parameters of the driver."""
+        fixed = {"device": self.device, "port": self.link, "sample_period": self.sample_period}
+        return fixed | emulated(self.device).driver
 
     def settings(self) -> dict[str, object]:
         """What the calibration will belong to."""

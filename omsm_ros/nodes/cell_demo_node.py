@@ -23,6 +23,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
+from omsm_ros.emulators.players import EMULATED
 from omsm_ros.errors import DeviceTimeoutError, OmsmError
 from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
@@ -150,7 +151,7 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
 
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
     processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
-    processes.start("confocal_driver", port=plan.link, sample_period=plan.sample_period)
+    processes.start("confocal_driver", **plan.driver_parameters())
     processes.start(
         "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
     )
@@ -158,7 +159,8 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
     node.wait_until(
         "the driver, calibrator and corrector to find each other",
         lambda: (
-            node.value("confocal_driver", "axes_subscribers") >= 2
+            node.value("confocal_driver", "connections") >= 1
+            and node.value("confocal_driver", "axes_subscribers") >= 2
             and node.value("confocal_driver", "confocal_subscribers") >= 2
         ),
     )
@@ -198,6 +200,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="cell_demo", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
     parser.add_argument("--time-lapse", type=float, default=20.0)
+    parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, default=12.7e-3, help="[m]")
     parser.add_argument("--json", action="store_true")
@@ -212,7 +215,11 @@ def main() -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     plan = Demonstration(
-        args.out, seed=args.seed, time_lapse=args.time_lapse, start_radius=args.start_radius
+        args.out,
+        seed=args.seed,
+        time_lapse=args.time_lapse,
+        start_radius=args.start_radius,
+        device=args.device,
     )
     stage = Stage(quiet=args.json)
     rclpy.init()

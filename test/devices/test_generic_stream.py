@@ -10,12 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omsm_ros.core.samples.blocks import Status
-from omsm_ros.devices.generic_stream import (
-    BlockPair,
-    GenericStreamDevice,
-    SequenceTracker,
-    StreamSettings,
-)
+from omsm_ros.devices.blocks import BlockPair
+from omsm_ros.devices.counting import Counting, SequenceTracker
+from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings, samples_of
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.protocols.generic_stream import (
     FRAME,
@@ -81,7 +78,8 @@ def run(
 
 def assert_consistent(blocks: list[BlockPair], device: GenericStreamDevice) -> None:
     found = device.statistics
-    assert found.frames == found.delivered + found.pending + found.duplicates
+    assert found.decoded == device.wire.frames
+    assert found.decoded == found.delivered + found.pending + found.duplicates
     assert found.delivered == sum(len(axes) for axes, _ in blocks)
     assert found.blocks == len(blocks)
     for axes, distance in blocks:
@@ -184,7 +182,7 @@ def test_a_broken_frame_is_a_gap_of_one() -> None:
     blocks, device = run(bytes(wire))
     assert spans(blocks) == [(0, 4), (5, 5)]
     found = device.statistics
-    assert found.lost == found.bad_crc + found.bad_cobs == 1
+    assert found.lost == device.wire.bad_crc + device.wire.bad_cobs == 1
 
 
 def test_duplicates_are_left_out_and_counted() -> None:
@@ -254,10 +252,11 @@ def test_tracker_agrees_with_plain_counting(
     """Against the definition, one frame at a time; portions as they come."""
     numbers = np.cumsum([start, *steps])
     frames = frames_of(numbers)
+    samples = samples_of(frames, StreamScaling())
     cuts = sorted({0, len(frames), *data.draw(st.lists(st.integers(0, len(frames))))})
-    tracker = SequenceTracker()
-    runs = [r for a, b in itertools.pairwise(cuts) for r in tracker.split(frames[a:b])]
-    seen = np.concatenate([r.first_sample + np.arange(len(r.frames)) for r in runs])
+    tracker = SequenceTracker(Counting(2**32))
+    runs = [r for a, b in itertools.pairwise(cuts) for r in tracker.split(samples[a:b])]
+    seen = np.concatenate([r.first_sample + np.arange(len(r.samples)) for r in runs])
     np.testing.assert_array_equal(seen, np.unique(numbers))
     assert tracker.duplicates == len(numbers) - len(np.unique(numbers))
     assert tracker.lost == numbers[-1] - numbers[0] + 1 - len(np.unique(numbers))
@@ -291,7 +290,7 @@ def test_unknown_verdicts_are_counted_and_lost() -> None:
         Status.NO_TARGET,
         Status.LOST,
     ]
-    assert device.statistics.unknown_status == 2
+    assert device.unknown_status == 2
 
 
 # --- time -------------------------------------------------------------------------------
@@ -363,7 +362,7 @@ def test_a_lost_connection_costs_nothing_that_had_arrived() -> None:
     assert spans(blocks) == [(0, 5), (7, 5)]
     assert_consistent(blocks, device)
     found = device.statistics
-    assert (found.lost, found.gaps, found.bad_length) == (2, 1, 1)
+    assert (found.lost, found.gaps, device.wire.bad_length) == (2, 1, 1)
 
 
 @pytest.mark.parametrize(

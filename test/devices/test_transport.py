@@ -173,6 +173,31 @@ def test_addresses_choose_their_transport() -> None:
     assert isinstance(transport_for("tcp://[::1]:7890"), TcpTransport)
 
 
+def test_a_serial_url_tells_its_own_baud_rate() -> None:
+    named = transport_for("serial:///dev/ttyUSB0?baud=460800", 9600)
+    assert isinstance(named, SerialTransport)
+    assert (named.name, named.baud_rate) == ("/dev/ttyUSB0", 460_800)
+    plain = transport_for("serial:///dev/ttyUSB0", 9600)
+    assert isinstance(plain, SerialTransport)
+    assert plain.baud_rate == 9600
+
+
+def test_urls_of_pyserial_are_passed_on() -> None:
+    echo = transport_for("loop://")
+    echo.open()
+    echo.write(b"there and back")
+    assert read_all(echo, 14) == b"there and back"
+    echo.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["serial://", "serial:///dev/x?speed=9", "serial:///dev/x?baud=fast"]
+)
+def test_malformed_serial_url_is_named(address: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"expected serial:///dev/ttyUSB0"):
+        transport_for(address)
+
+
 @pytest.mark.parametrize("address", ["tcp://host", "tcp://host:", "tcp://:7890", "tcp://h:x"])
 def test_malformed_address_is_named(address: str) -> None:
     with pytest.raises(ConfigurationError, match="expected tcp://host:port"):

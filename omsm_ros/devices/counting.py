@@ -1,0 +1,207 @@
+"""Which sample is it? Wrapping device counters → one trigger counter that never wraps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.units import NANOSECOND_S
+
+SAMPLE = np.dtype(
+    [
+        ("counter", "<i8"),  # as the device sends it, wraps
+        ("time", "<i8"),  # of the device [ns], does not wrap; 0 where it tells none
+        ("distance", "<f8"),  # [m], NaN where there is none
+        ("intensity", "<f4"),  # 0-1, NaN where the device tells none
+        ("status", "u1"),  # Status
+        ("counts", "<i8", (5,)),  # encoders X, Y, Z, B, C
+    ]
+)
+Samples: TypeAlias = NDArray[np.void]
+"""Structured array of shape (n,), dtype ``SAMPLE``: what every device's driver makes first."""
+
+# A gap may be this much longer than the time that passed, since arrivals are not even [s].
+_SLACK_S = 0.5
+# Copies of samples that were sent before are recognised this far back.
+_REMEMBERED = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Samples (n,) with consecutive trigger counts from ``first_sample``.
+
+    restarted: the device started anew just before
+    """
+
+    samples: Samples
+    first_sample: int
+    restarted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Counting:
+    """How a device counts.
+
+    modulus: its counter starts again at zero there
+    timed: its samples carry its own time
+    checked: a checksum guards the counter; without, a counter that leaps and comes back with
+    the next sample is a spoilt telegram
+    period: of a device that runs freely [s]: its counter goes on in a silence, and cannot have
+    gone further than time has; 0 = triggered, its counter waits for the next trigger
+    """
+
+    modulus: int
+    timed: bool = True
+    checked: bool = True
+    period: float = 0.0
+
+
+class SequenceTracker:
+    """Samples in the order of arrival → runs, with everything that is missing or too much counted.
+
+    The same sample again is a duplicate. A counter or a time that falls back is a restarted
+    device, and its own number counts from there; so is, after a silence, a counter at zero.
+    Anything else that is not the next number is a gap.
+    """
+
+    def __init__(self, counting: Counting) -> None:
+        self.duplicates = self.lost = self.gaps = self.restarts = self.spoilt = 0
+        self._counting = counting
+        self._raw = self._time = self._counter = 0
+        self._begun = self._anew = False
+        self._held = np.empty(0, SAMPLE)
+        self._recent = np.zeros(_REMEMBERED, SAMPLE)
+        self._recent["counter"] = -1
+
+    @property
+    def held(self) -> int:
+        """Samples that wait for their successor to tell whether they are spoilt."""
+        return len(self._held)
+
+    def begin_anew(self) -> None:
+        """The device is known to have been restarted: its next number counts from there."""
+        self._anew = self._begun
+
+    def split(
+        self, samples: Samples, elapsed: float = 0.0, *, broken: bool = False
+    ) -> Iterator[Run]:
+        """Runs of ``samples`` (n,), in order.
+
+        elapsed: how long nothing had come before [s];  broken: that was a silence, or the line
+        was down
+        """
+        samples, self._held = np.concatenate([self._held, samples]), np.empty(0, SAMPLE)
+        pause = _Break(elapsed, broken)
+        while len(samples):
+            count = 0 if broken or self._anew else self._in_order(samples)
+            if count:
+                yield self._accept(samples[:count], self._counter + 1, False)
+            elif self._waits(samples):
+                self._held = samples.copy()
+                return
+            else:
+                yield from self._one(samples, pause)
+                pause, broken, count = _Break(), False, 1
+            samples = samples[count:]
+
+    def settle(self) -> Iterator[Run]:
+        """The sample held back, when nothing came after it."""
+        held, self._held = self._held, np.empty(0, SAMPLE)
+        if len(held):
+            yield from self._one(held, _Break())
+
+    def _in_order(self, samples: Samples) -> int:
+        """How many samples at the beginning just go on."""
+        if not self._begun:
+            return 0
+        steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
+        good = steps == 1
+        if self._counting.timed:
+            good &= np.diff(samples["time"], prepend=self._time) >= 0
+        return len(good) if good.all() else int(np.argmin(good))
+
+    def _accept(self, samples: Samples, first: int, restarted: bool) -> Run:
+        self._begun, self._anew = True, False
+        self._raw, self._time = int(samples["counter"][-1]), int(samples["time"][-1])
+        self._counter = first + len(samples) - 1
+        self._recent[samples["counter"] % _REMEMBERED] = samples
+        return Run(samples, first, restarted)
+
+    def _waits(self, samples: Samples) -> bool:
+        """Whether the only sample left leaps, and the next must tell whether it is spoilt."""
+        return len(samples) == 1 and self._leaps(samples[0])
+
+    def _leaps(self, sample: np.void) -> bool:
+        if self._counting.checked or not self._begun or self._anew:
+            return False
+        return self._step(int(sample["counter"])) > 1 and not self._sent_before(sample)
+
+    def _spoilt(self, samples: Samples) -> bool:
+        """Whether the counter leaps at the first sample and is back at the next."""
+        if len(samples) < 2 or not self._leaps(samples[0]):
+            return False
+        here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
+        return after < here
+
+    def _step(self, raw: int) -> int:
+        return (raw - self._raw) % self._counting.modulus
+
+    def _one(self, samples: Samples, pause: _Break) -> Iterator[Run]:
+        """What becomes of the first of ``samples``, which does not just go on."""
+        sample, alone = samples[0], samples[:1]
+        raw = int(sample["counter"])
+        if not self._begun:
+            yield self._accept(alone, raw, False)
+            return
+        step, advance = self._step(raw), int(sample["time"]) - self._time
+        in_order = step == 1 and advance >= 0
+        if self._spoilt(samples):
+            self.spoilt += 1
+        elif not (in_order or self._anew) and self._sent_before(sample):
+            self.duplicates += 1
+        elif self._anew or self._fallen(raw, step, advance, pause):
+            self.restarts += 1
+            yield self._accept(alone, raw, True)
+        elif step == 0:
+            self.duplicates += 1
+        else:
+            step += self._turns(step, pause) * self._counting.modulus
+            self.lost += step - 1
+            self.gaps += step > 1
+            yield self._accept(alone, self._counter + step, False)
+
+    def _sent_before(self, sample: np.void) -> bool:
+        remembered = self._recent[int(sample["counter"]) % _REMEMBERED]
+        return bool(remembered.tobytes() == sample.tobytes())
+
+    def _fallen(self, raw: int, step: int, advance: int, pause: _Break) -> bool:
+        if step == 1:
+            return advance < 0
+        if pause.broken and raw == 0:
+            return True
+        if step == 0 or advance < 0:
+            return advance != 0
+        period = self._counting.period
+        if not period:
+            return step >= self._counting.modulus // 2
+        passed = advance * NANOSECOND_S if self._counting.timed else pause.elapsed
+        return (step - 1) * period > passed + _SLACK_S * (not self._counting.timed) + period
+
+    def _turns(self, step: int, pause: _Break) -> int:
+        """Whole turns of the counter that a silence hid."""
+        if not self._counting.period:
+            return 0
+        hidden = pause.elapsed / self._counting.period - step
+        return max(0, round(hidden / self._counting.modulus))
+
+
+@dataclass(frozen=True, slots=True)
+class _Break:
+    """What lay before a sample."""
+
+    elapsed: float = 0.0
+    broken: bool = False

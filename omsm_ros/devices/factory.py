@@ -1,0 +1,144 @@
+"""Which devices there are, what can be set on each, and how one is made from its parameters."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
+
+from omsm_ros.devices.chrocodile import ChrocodileDevice, ChrocodileSettings
+from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
+from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.protocols.generic_stream import AXES, AxisScaling, ProbeScaling, StreamScaling
+
+Values: TypeAlias = Mapping[str, Any]
+NowNs: TypeAlias = Callable[[], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One thing that can be set; the same names in ROS, YAML and here."""
+
+    name: str
+    default: bool | int | float | str
+    description: str
+
+
+_USUAL = StreamScaling()
+
+PARAMETERS = (
+    Parameter("device", "six_channel", "what is connected: see the table of devices"),
+    Parameter("port", "/tmp/omsm_cell", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, path"),
+    Parameter("baud_rate", DEFAULT_BAUD_RATE, "of a serial port that does not name its own"),
+    Parameter("sample_period", 1e-3, "of the trigger, or of a device that runs freely [s]"),
+    Parameter("block_size", 100, "samples in a message"),
+    *(
+        parameter
+        for name, axis in zip(AXES, _USUAL.axes, strict=True)
+        for parameter in (
+            Parameter(f"{name}.counts_per_unit", axis.counts_per_unit, "counts per m or rad"),
+            Parameter(f"{name}.sign", axis.sign, "+1 or -1"),
+            Parameter(f"{name}.offset", axis.offset, "position at zero counts [m, rad]"),
+            Parameter(f"{name}.wrap", axis.wrap, "counts at which it wraps; 0 = as the device"),
+        )
+    ),
+    Parameter("probe.full_scale", _USUAL.probe.full_scale, "measuring range [m]"),
+    Parameter("probe.polarity", _USUAL.probe.polarity, "+1: falls as z rises; -1: reversed"),
+    Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
+    Parameter("probe.intensity_full_scale", 100.0, "reading that is intensity 1"),
+    Parameter("encoders", "", "the probe's own on X Y Z B C, e.g. XYZUV; empty = none wired"),
+    Parameter("latch", "start", "of its encoders at the exposure's start, end, or their mean"),
+    Parameter("trigger", "free_run", "free_run, each, once or window"),
+    Parameter("format", "binary", "of the telegrams: binary or ascii"),
+    Parameter("signals", "", "numbers for $SODX; empty = what is needed"),
+    Parameter("lamp", -1.0, "brightness 0-100; negative = as the device has it"),
+    Parameter("averaging", -1, "samples; negative = as the device has it"),
+    Parameter("threshold", -1.0, "of detection; negative = as the device has it"),
+    Parameter("sensor_head", -1, "0-15; negative = as the device has it"),
+)
+
+
+def defaults() -> dict[str, Any]:
+    """Every parameter at its default."""
+    return {parameter.name: parameter.default for parameter in PARAMETERS}
+
+
+def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
+    """The device that ``values`` describe, not yet connected.
+
+    values: every name of PARAMETERS. Raises ConfigurationError.
+    """
+    make = DEVICES.get(values["device"])
+    if make is None:
+        raise ConfigurationError(f"device {values['device']!r}, expected one of {sorted(DEVICES)}")
+    return make(values, transport_for(values["port"], values["baud_rate"]), now_ns)
+
+
+def _axes(values: Values) -> dict[str, AxisScaling]:
+    return {
+        axis: AxisScaling(**{f.name: values[f"{axis}.{f.name}"] for f in fields(AxisScaling)})
+        for axis in AXES
+    }
+
+
+def _blocks(values: Values) -> dict[str, Any]:
+    return {"sample_period": values["sample_period"], "block_size": values["block_size"]}
+
+
+def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+    probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
+    scaling = StreamScaling(**_axes(values), probe=probe)
+    settings = StreamSettings(**_blocks(values), scaling=scaling)
+    return GenericStreamDevice(transport, settings, now_ns)
+
+
+def _chrocodile(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+    settings = ChrocodileSettings(
+        **_blocks(values),
+        signals=_numbers("signals", values["signals"]),
+        axes=tuple(_axes(values).values()) if values["encoders"] else None,
+        encoders=_encoders(values["encoders"] or "XYZUV"),
+        latch=values["latch"],
+        trigger=values["trigger"],
+        format=values["format"],
+        lamp=_unless_negative(values["lamp"]),
+        averaging=_unless_negative(values["averaging"]),
+        threshold=_unless_negative(values["threshold"]),
+        head=_unless_negative(values["sensor_head"]),
+        probe=_probe_reading(values),
+    )
+    return ChrocodileDevice(transport, settings, now_ns)
+
+
+def _probe_reading(values: Values) -> ProbeReading:
+    return ProbeReading(**{f.name: values[f"probe.{f.name}"] for f in fields(ProbeReading)})
+
+
+def _numbers(name: str, text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in text.replace(",", " ").split())
+    except ValueError as err:
+        raise ConfigurationError(f"{name} {text!r}, expected numbers, like '83 256 257'") from err
+
+
+def _encoders(text: str) -> tuple[int, ...]:
+    letters = "XYZUV"
+    if sorted(text.upper()) != sorted(letters):
+        raise ConfigurationError(
+            f"encoders {text!r}, expected the letters {letters} in the order of X, Y, Z, B, C"
+        )
+    return tuple(letters.index(letter) for letter in text.upper())
+
+
+def _unless_negative(value: Any) -> Any:
+    return None if value < 0 else value
+
+
+DEVICES: dict[str, Callable[[Values, Transport, NowNs], StreamDevice]] = {
+    "six_channel": _six_channel,
+    "chrocodile": _chrocodile,
+}

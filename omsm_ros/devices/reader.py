@@ -1,0 +1,108 @@
+"""Keeps a device read, whatever happens on its line."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Protocol
+
+from omsm_ros.devices.blocks import BlockPair
+from omsm_ros.errors import ConfigurationError, DeviceError
+
+_READ_S = 0.05
+# The pause before connecting again doubles from the first to the second [s].
+BACK_OFF_S = (0.25, 5.0)
+
+
+class Readable(Protocol):
+    """What a reader reads."""
+
+    @property
+    def trouble(self) -> str:
+        """Return why its samples cannot be used; empty if they can."""
+
+    def open(self) -> None:
+        """Connect and set up; raises DeviceError."""
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """Return blocks that came within ``timeout`` [s]; raises DeviceError."""
+
+    def close(self) -> list[BlockPair]:
+        """Disconnect and return the partial block."""
+
+
+class State(Enum):
+    """Of a reader."""
+
+    CONNECTING = "connecting"  # or setting the device up
+    READING = "reading"
+    LOST = "lost"  # waits before it connects again
+    ENDED = "ended"
+
+
+class DeviceReader:
+    """Connects, reads, hands blocks over, and connects again after growing pauses.
+
+    trouble: what keeps it from reading, one line; empty while all is well
+    connections: how often the device was connected and set up
+    """
+
+    def __init__(
+        self,
+        device: Readable,
+        deliver: Callable[[Sequence[BlockPair]], None],
+        note: Callable[[str], None] = lambda _: None,
+        back_off: tuple[float, float] = BACK_OFF_S,
+    ) -> None:
+        """note: told once of each new trouble, and when it is over."""
+        self.state = State.CONNECTING
+        self.trouble = "not connected yet"
+        self.connections = 0
+        self._device = device
+        self._deliver = deliver
+        self._note = note
+        self._back_off = back_off
+
+    def run(self, stop: threading.Event) -> None:
+        """Read until ``stop``."""
+        pause = self._back_off[0]
+        while not stop.is_set():
+            if self._read_once(stop):
+                pause = self._back_off[0]
+            if stop.wait(pause):
+                break
+            pause = min(2 * pause, self._back_off[1])
+        self.state = State.ENDED
+
+    def _read_once(self, stop: threading.Event) -> bool:
+        """Read until the device is lost; whether any sample came."""
+        self.state, any_came = State.CONNECTING, False
+        try:
+            self._device.open()
+            self._connected()
+            while not stop.is_set():
+                blocks = self._device.poll(_READ_S)
+                any_came |= bool(blocks)
+                self._hand_over(blocks)
+        except (DeviceError, ConfigurationError) as err:
+            self._tell(str(err))
+            self.state = State.LOST
+        self._hand_over(self._device.close())
+        return any_came
+
+    def _connected(self) -> None:
+        self.connections += 1
+        self.state = State.READING
+        self._tell("")
+
+    def _hand_over(self, blocks: Sequence[BlockPair]) -> None:
+        if blocks:
+            self._deliver(blocks)
+        if self.state is State.READING:
+            self._tell(self._device.trouble)
+
+    def _tell(self, trouble: str) -> None:
+        if trouble != self.trouble:
+            self.trouble = trouble
+            self._note(f"{trouble}; trying again" if trouble else "connected and set up")

@@ -1,0 +1,181 @@
+"""What every device that sends samples has in common: from bytes to blocks, all accounted for.
+
+``decoded = delivered + pending + held + duplicates + spoilt + withheld``; what never came is
+``lost``, what came broken is counted by the decoder of the protocol.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from omsm_ros.devices.blocks import BlockCutter, BlockPair, BlockSettings, Channels
+from omsm_ros.devices.counting import SAMPLE, Counting, Samples, SequenceTracker
+from omsm_ros.devices.transport import Transport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamStatistics:
+    """Everything counted since construction, exact between two calls of ``poll``.
+
+    decoded: samples that came whole
+    delivered, pending: in blocks handed over, and waiting for their block to fill
+    held: waiting for their successor;  spoilt: whose counter leapt there and back
+    duplicates: received twice
+    withheld: kept back because the device runs at another rate than it was set to
+    lost, gaps: trigger counts that never arrived, and in how many places
+    restarts: the device's counter or clock fell back
+    period_deviation: of the last full block's device time from nominal, relative
+    period_warnings: full blocks beyond PERIOD_TOLERANCE
+    """
+
+    decoded: int = 0
+    delivered: int = 0
+    pending: int = 0
+    held: int = 0
+    spoilt: int = 0
+    duplicates: int = 0
+    withheld: int = 0
+    lost: int = 0
+    gaps: int = 0
+    restarts: int = 0
+    blocks: int = 0
+    period_deviation: float = 0.0
+    period_warnings: int = 0
+
+
+class StreamDevice:
+    """Reads a stream of samples and hands over blocks.
+
+    A model fills in ``_prepare`` (set it up), ``_decode`` and ``_rest`` (bytes → samples) and
+    ``_listen_in`` (is it still there?). The trigger count lives on over ``close`` and
+    ``open``, so what a lost connection cost shows up as a gap.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: BlockSettings,
+        channels: Channels,
+        counting: Counting,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """now_ns: the host clock that stamps refer to [ns];  monotonic: for time-outs [s]."""
+        self.channels = channels
+        self._transport = transport
+        self._settings = settings
+        self._now_ns = now_ns
+        self._monotonic = monotonic
+        self._tracker = SequenceTracker(counting)
+        self._cutter = BlockCutter(settings, channels)
+        self._decoded = 0
+        self._heard = monotonic()
+        self._down = False
+
+    def open(self) -> None:
+        """Connect, or connect again, and set the device up; raises DeviceError."""
+        self._transport.open()
+        self._down = True
+        self._prepare()
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """Blocks completed by what arrives within ``timeout`` [s]; may be none.
+
+        Raises DeviceError when the connection or the device is lost; ``close`` then still
+        hands over the partial block.
+        """
+        data = self._transport.read(timeout)
+        arrival_ns, now = self._now_ns(), self._monotonic()
+        samples = self._decode(data)
+        silent = now - self._heard
+        if len(samples):
+            self._heard = now
+            return self._add(samples, arrival_ns, silent)
+        if silent <= self._settings.pause:
+            return []
+        blocks = self._end(arrival_ns)
+        self._listen_in(silent)
+        return blocks
+
+    def close(self) -> list[BlockPair]:
+        """Disconnect and hand over the partial block, if any."""
+        blocks = self._end(self._now_ns())
+        self._transport.close()
+        return blocks
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Make, model, version and settings as the device told them; empty before it did."""
+        return {}
+
+    @property
+    def trouble(self) -> str:
+        """Why the samples cannot be used although the device sends them; empty if they can."""
+        if self._cutter.wrong_rate:
+            period = self._settings.sample_period
+            found = 1 / (period * (1 + self._cutter.period_deviation))
+            return (
+                f"{self._transport.name} measures at {found:.6g} Hz, set is {1 / period:.6g} Hz; "
+                "its samples are withheld: set sample_period to what the device does"
+            )
+        return ""
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        """What became of every sample."""
+        tracker, cutter = self._tracker, self._cutter
+        return StreamStatistics(
+            decoded=self._decoded,
+            delivered=cutter.delivered,
+            pending=cutter.pending,
+            held=tracker.held,
+            spoilt=tracker.spoilt,
+            duplicates=tracker.duplicates,
+            withheld=cutter.withheld,
+            lost=tracker.lost,
+            gaps=tracker.gaps,
+            restarts=tracker.restarts,
+            blocks=cutter.blocks,
+            period_deviation=cutter.period_deviation,
+            period_warnings=cutter.period_warnings,
+        )
+
+    def counts(self) -> dict[str, float]:
+        """All statistics by name, those of the protocol included."""
+        return asdict(self.statistics)
+
+    # --- what a model fills in
+
+    def _prepare(self) -> None:
+        """Set the device up; raises DeviceError."""
+
+    def _decode(self, data: bytes) -> Samples:
+        """Samples that ``data`` completes, shape (n,); n may be 0."""
+        raise NotImplementedError
+
+    def _rest(self) -> Samples:
+        """A sample that was complete, but waited for what follows it; shape (n,)."""
+        return np.empty(0, SAMPLE)
+
+    def _listen_in(self, silent: float) -> None:
+        """Nothing came for ``silent`` [s]: raise DeviceError if the device is gone."""
+
+    # --- common
+
+    def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
+        self._decoded += len(samples)
+        after_silence = self._down or silent > self._settings.pause
+        self._down = False
+        runs = list(self._tracker.split(samples, silent, broken=after_silence))
+        return list(self._cutter.add(runs, arrival_ns, after_silence=after_silence))
+
+    def _end(self, arrival_ns: int) -> list[BlockPair]:
+        """Everything that waited, now that nothing follows."""
+        rest = self._rest()
+        blocks = self._add(rest, arrival_ns, 0.0) if len(rest) else []
+        blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)
+        return [*blocks, *self._cutter.flush()]

@@ -1,0 +1,157 @@
+"""Emulated devices by name: what carries them, what plays motions on them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
+from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
+from omsm_ros.emulators.instrument import Instrument, Line
+from omsm_ros.emulators.pseudo_terminal import Pty
+from omsm_ros.emulators.sources import RecordingSource
+from omsm_ros.emulators.tcp_server import TcpServer
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.protocols.generic_stream import AXES
+from omsm_ros.twin.cell import Probe, Recording
+from omsm_ros.units import MICROMETRE_M
+
+_TCP = "tcp://127.0.0.1:"
+_END_S = 5.0
+# The twin's probe measures about its middle, this one from the beginning of its range.
+_READING = ProbeReading(full_scale=100 * MICROMETRE_M, zero=Probe().half_range)
+
+
+def line_for(link: str) -> Pty | TcpServer:
+    """The emulated port: ``tcp://127.0.0.1:port``, or the path of a link to a pseudo-terminal."""
+    if not link.startswith("tcp://"):
+        return Pty(link)
+    if not (link.startswith(_TCP) and link.removeprefix(_TCP).isdecimal()):
+        raise ConfigurationError(
+            f"link {link!r}, expected a path or {_TCP}PORT: an emulator stays on this machine"
+        )
+    return TcpServer(int(link.removeprefix(_TCP)))
+
+
+class Player(Protocol):
+    """Plays motions on an emulated device, one at a time."""
+
+    @property
+    def playing(self) -> bool:
+        """Return whether a motion has samples left."""
+
+    @property
+    def played(self) -> int:
+        """Return samples of the motion so far."""
+
+    def start(self, recording: Recording, time_lapse: float) -> None:
+        """Begin a motion; its trigger counts from zero."""
+
+    def halt(self) -> None:
+        """End the motion."""
+
+    def close(self) -> None:
+        """End the motion and the device."""
+
+
+class StreamPlayer:
+    """Our own stream: a new sender for each motion."""
+
+    def __init__(self, line: Line, faults: Faults) -> None:
+        self._line, self._faults = line, faults
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.played = 0
+
+    @property
+    def playing(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, recording: Recording, time_lapse: float) -> None:
+        emulator = GenericStreamEmulator(self._line, faults=self._faults)
+        self._stop.clear()
+        self.played = 0
+        arguments = (recording, time_lapse, self._stop, self._on_progress)
+        self._thread = threading.Thread(target=emulator.play, args=arguments, daemon=True)
+        self._thread.start()
+
+    def _on_progress(self, samples: int) -> None:
+        self.played = samples
+
+    def halt(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=_END_S)
+
+    def close(self) -> None:
+        self.halt()
+
+
+class InstrumentPlayer:
+    """An instrument that answers all the time, and measures while a motion triggers it."""
+
+    def __init__(self, instrument: Instrument) -> None:
+        self._instrument = instrument
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=instrument.serve, args=(self._stop,), daemon=True)
+        self._thread.start()
+
+    @property
+    def playing(self) -> bool:
+        return self._instrument.playing
+
+    @property
+    def played(self) -> int:
+        return self._instrument.played
+
+    def start(self, recording: Recording, time_lapse: float) -> None:
+        self._instrument.play(RecordingSource(recording), time_lapse)
+
+    def halt(self) -> None:
+        self._instrument.halt()
+
+    def close(self) -> None:
+        self.halt()
+        self._stop.set()
+        self._thread.join(timeout=_END_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Emulated:
+    """player: makes it on a line;  driver: parameters a driver needs to read it;
+    tcp: it needs a TCP port, where others also work on a serial one.
+    """
+
+    player: Callable[[Line, Faults], Player]
+    driver: dict[str, object]
+    tcp: bool = False
+
+
+def _chrocodile(line: Line, faults: Faults) -> Player:
+    emulator = ChrocodileEmulator(line, triggered=True, seed=faults.seed, probe=_READING)
+    return InstrumentPlayer(emulator)
+
+
+_OWN_ENCODERS: dict[str, object] = {
+    "encoders": "XYZUV",
+    "trigger": "each",
+    "probe.zero": _READING.zero,
+} | {
+    f"{name}.counts_per_unit": axis.counts_per_unit
+    for name, axis in zip(AXES, AXIS_SCALING, strict=True)
+}
+
+EMULATED = {
+    "six_channel": Emulated(StreamPlayer, {}),
+    "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
+}
+
+
+def emulated(device: str) -> Emulated:
+    """The emulated device of that name; ConfigurationError if there is none."""
+    if device not in EMULATED:
+        raise ConfigurationError(f"device {device!r}, expected one of {sorted(EMULATED)}")
+    return EMULATED[device]

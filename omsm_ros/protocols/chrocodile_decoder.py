@@ -1,0 +1,220 @@
+"""Bytes of a CHRocodile in the dollar protocol → telegrams, in any portions.
+
+The sync pair also occurs in the data. So the place is kept by counting, from ``ready`` on,
+and searched only when a sync is missing where it is due. A telegram counts once the sync of
+the next one has come: bytes lost inside it would show there. What a flipped bit does to a
+value, nothing in this protocol can show.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.protocols.chrocodile_telegram import (
+    FLOAT,
+    FORMATS,
+    MAX_TELEGRAM_BYTES,
+    SAMPLE_COUNTER,
+    Layout,
+    Records,
+)
+
+# Two telegrams found in garbage belong together if no more samples than this lie between.
+_NEAR = 16
+_NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+
+
+@dataclass(frozen=True, slots=True)
+class TelegramStatistics:
+    """What became of every byte: ``received = in telegrams + discarded + pending``.
+
+    telegrams: decoded;  losses_of_sync: how often the place in the stream was lost
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    telegrams: int
+    losses_of_sync: int
+
+
+class BinaryDecoder:
+    """Bytes in any portions → telegrams; nothing raises, memory is two telegrams and a portion."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._dtype = layout.dtype
+        self._due = int.from_bytes(layout.sync, "big")
+        self._buffer = b""
+        self._synchronised = False
+        self._received = self._telegrams = self._losses = 0
+
+    def reset(self, *, synchronised: bool) -> None:
+        """Forget an unfinished telegram; ``synchronised``: the next byte begins one."""
+        self._buffer = b""
+        self._synchronised = synchronised
+
+    def feed(self, data: bytes) -> Records:
+        """Telegrams that ``data`` confirms, shape (n,); n may be 0."""
+        self._received += len(data)
+        self._buffer += data
+        parts = []
+        while self._synchronised or self._search():
+            parts.append(self._take())
+            if self._synchronised:
+                break
+        found = np.frombuffer(b"".join(parts), self._dtype)
+        self._telegrams += len(found)
+        return found
+
+    def settle(self) -> Records:
+        """The last telegram, if it is whole and nothing came after it; shape (0,) or (1,)."""
+        whole = len(self._buffer) == self._layout.length
+        if not (self._synchronised and whole and self._buffer.startswith(self._layout.sync)):
+            return np.empty(0, self._dtype)
+        found = np.frombuffer(self._buffer, self._dtype)
+        self._buffer = b""
+        self._telegrams += 1
+        return found
+
+    @property
+    def statistics(self) -> TelegramStatistics:
+        """Return what became of every byte."""
+        decoded = self._telegrams * self._layout.length
+        return TelegramStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - decoded - len(self._buffer),
+            bytes_pending=len(self._buffer),
+            telegrams=self._telegrams,
+            losses_of_sync=self._losses,
+        )
+
+    def _take(self) -> bytes:
+        """Telegrams up to the last one whose successor has begun, or to a missing sync."""
+        length, buffer = self._layout.length, self._buffer
+        whole = len(buffer) // length
+        records = np.frombuffer(buffer, self._dtype, whole)
+        bad = np.flatnonzero(records["sync"] != self._due)
+        rest = buffer[whole * length :][:2]
+        if not len(bad) and not self._layout.sync.startswith(rest):
+            bad = np.array([whole])
+        if not len(bad):
+            count = whole if len(rest) == 2 else max(0, whole - 1)
+            self._buffer = buffer[count * length :]
+            return buffer[: count * length]
+        # The telegram before a missing sync is too short or too long: it is none.
+        count = max(0, int(bad[0]) - 1)
+        self._buffer = buffer[count * length + (bad[0] > 0) :]
+        self._synchronised = False
+        self._losses += 1
+        return buffer[: count * length]
+
+    def _search(self) -> bool:
+        """Go to the first two telegrams in a row; keep only what may still become that."""
+        length, size = self._layout.length, len(self._buffer)
+        raw = np.frombuffer(self._buffer + bytes(2 * length), np.uint8)
+        first, second = self._layout.sync
+        sync = (raw[:-1] == first) & (raw[1:] == second)
+        starts = np.flatnonzero(sync[:size])
+        starts = starts[sync[starts + length] | (starts + length + 2 > size)]
+        whole = starts + 2 * length <= size
+        found = np.flatnonzero(~whole | self._plausible(raw, starts))
+        if not len(found):
+            self._buffer = self._buffer[-1:] if self._buffer.endswith(bytes([first])) else b""
+            return False
+        self._buffer = self._buffer[starts[found[0]] :]
+        self._synchronised = bool(whole[found[0]])
+        return self._synchronised
+
+    def _plausible(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Where the sample counter, if there is one, goes on between two telegrams."""
+        if SAMPLE_COUNTER not in self._layout.signals:
+            return np.ones(len(starts), np.bool_)
+        index = self._layout.signals.index(SAMPLE_COUNTER)
+        kind = np.dtype(FORMATS[self._layout.types[index]])
+        place = starts + self._layout.offsets[index]
+        here, after = (
+            raw[at[:, np.newaxis] + np.arange(kind.itemsize)].copy().view(kind)[:, 0].astype(int)
+            for at in (place, place + self._layout.length)
+        )
+        step = (after - here) % 2 ** (8 * kind.itemsize)
+        return np.asarray((step >= 1) & (step <= _NEAR))
+
+
+class LineDecoder:
+    """ASCII telegrams in any portions → the records ``BinaryDecoder`` gives.
+
+    A line must begin with its space and hold as many numbers as there are signals; without a
+    checksum, a digit lost within a number cannot be noticed.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._dtype = layout.dtype
+        self._line = re.compile(rb"(?: +%s){%d} *\r?" % (_NUMBER, len(layout.signals)))
+        self._tail = b""
+        self._synchronised = False
+        self._received = self._kept = self._telegrams = self._losses = 0
+
+    def reset(self, *, synchronised: bool) -> None:
+        """Forget an unfinished line; ``synchronised``: the next byte begins one."""
+        self._tail = b""
+        self._synchronised = synchronised
+
+    def feed(self, data: bytes) -> Records:
+        """Telegrams completed by ``data``, shape (n,); n may be 0."""
+        self._received += len(data)
+        *lines, tail = (self._tail + data).split(b"\n")
+        if len(tail) > MAX_TELEGRAM_BYTES:
+            tail, self._synchronised = b"", False
+        self._tail = tail
+        rows = [row for line in lines if (row := self._row(line)) is not None]
+        self._telegrams += len(rows)
+        made = self._layout.records(len(rows))
+        for number, column in zip(self._layout.signals, zip(*rows, strict=True), strict=False):
+            made[str(number)] = column
+        return made
+
+    def settle(self) -> Records:
+        """Nothing: a line tells its end by itself; shape (0,)."""
+        return np.empty(0, self._dtype)
+
+    @property
+    def statistics(self) -> TelegramStatistics:
+        return TelegramStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - self._kept - len(self._tail),
+            bytes_pending=len(self._tail),
+            telegrams=self._telegrams,
+            losses_of_sync=self._losses,
+        )
+
+    def _row(self, line: bytes) -> tuple[float, ...] | None:
+        row = self._values(line)
+        if row is None:
+            self._losses += self._synchronised
+            self._synchronised = True  # the next line begins after this one's end
+            return None
+        self._synchronised = True
+        self._kept += len(line) + 1
+        return row
+
+    def _values(self, line: bytes) -> tuple[float, ...] | None:
+        if len(line) > MAX_TELEGRAM_BYTES or not self._line.fullmatch(line):
+            return None
+        row = tuple(map(float, line.split()))
+        for value, kind in zip(row, self._layout.types, strict=True):
+            if not _fits(value, kind):
+                return None
+        return row
+
+
+def _fits(value: float, kind: int) -> bool:
+    if kind == FLOAT:
+        return abs(value) <= float(np.finfo(np.float32).max)
+    limits = np.iinfo(FORMATS[kind])
+    return limits.min <= value <= limits.max and value == int(value)

@@ -1,0 +1,91 @@
+"""Every emulated device over a real line into its real driver: the twin's motion comes out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.samples.blocks import Status
+from omsm_ros.devices.blocks import BlockPair
+from omsm_ros.devices.factory import DEVICES, defaults, make_device
+from omsm_ros.devices.reader import DeviceReader
+from omsm_ros.emulators.generic_stream import Faults
+from omsm_ros.emulators.players import EMULATED, emulated, line_for
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.cell import Recording
+
+SOON = 20.0
+
+
+def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> list[BlockPair]:
+    """What a driver makes of a motion."""
+    got: list[BlockPair] = []
+    stop = threading.Event()
+    with line_for(link) as line:
+        player = emulated(name).player(line, Faults())
+        values = defaults() | {"device": name, "port": line.path} | emulated(name).driver
+        device = make_device(values)
+        reader = DeviceReader(device, got.extend)
+        thread = threading.Thread(target=reader.run, args=(stop,))
+        thread.start()
+        try:
+            wait(lambda: reader.connections == 1, reader)
+            player.start(recording, lapse)
+            wait(lambda: device.statistics.delivered >= len(recording.axes), reader)
+        finally:
+            stop.set()
+            thread.join(SOON)
+            player.close()
+        assert device.statistics.lost == device.statistics.duplicates == 0
+    return got
+
+
+def wait(done: object, reader: DeviceReader) -> None:
+    deadline = time.monotonic() + SOON
+    while not done():  # type: ignore[operator]
+        assert time.monotonic() < deadline, reader.trouble
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("where", ["pty", "tcp"])
+@pytest.mark.parametrize("name", DEVICES)
+def test_the_twins_motion_comes_out(
+    name: str, where: str, tmp_path: Path, step_test: Recording
+) -> None:
+    if where == "pty" and EMULATED[name].tcp:
+        pytest.skip("speaks TCP only")
+    link = str(tmp_path / "probe") if where == "pty" else "tcp://127.0.0.1:0"
+    blocks = play(name, link, step_test)
+    axes = [b.axes for b in blocks if b.axes is not None]
+    distances = [b.distance for b in blocks if b.distance is not None]
+    assert [b.first_sample for b in distances] == list(range(0, len(step_test.axes), 100))
+    distance = np.concatenate([b.distance for b in distances])
+    status = np.concatenate([b.status for b in distances])
+    np.testing.assert_array_equal(status == Status.OK, step_test.distance.status == Status.OK)
+    np.testing.assert_allclose(distance, step_test.distance.distance, rtol=0, atol=0.51e-9)
+    if axes:
+        for letter, half_count in (
+            ("x", 5e-11),
+            ("y", 5e-11),
+            ("z", 5e-11),
+            ("b", 2e-8),
+            ("c", 2e-8),
+        ):
+            found = np.concatenate([getattr(b, letter) for b in axes])
+            expected = getattr(step_test.axes, letter)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=half_count * 1.001)
+
+
+@pytest.mark.parametrize("link", ["tcp://192.168.0.1:7890", "tcp://127.0.0.1:x"])
+def test_an_emulator_stays_on_this_machine(link: str) -> None:
+    with pytest.raises(ConfigurationError, match="stays on this machine"):
+        line_for(link)
+
+
+def test_an_unknown_device_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="device 'ruler'"):
+        emulated("ruler")
