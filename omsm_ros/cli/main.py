@@ -19,6 +19,8 @@ from omsm_ros.storage import strict_json
 
 DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
 
+_LONGEST_LINE = 1500
+
 # A correction takes a quarter of a second; loading what identifies would take twice that.
 WORDS = {
     "omsm_ros.cli.measuring": ("inspect", "predict", "correct"),
@@ -102,4 +104,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _say(text: str) -> None:
-    print("omsm:", " ".join(text.split()), file=sys.stderr)
+    line = " ".join(text.split())
+    if len(line) > _LONGEST_LINE:  # a path of thousands of characters; the remedy stands last
+        line = f"{line[: _LONGEST_LINE // 2]} … {line[-_LONGEST_LINE // 2 :]}"
+    print("omsm:", line, file=sys.stderr)

@@ -15,7 +15,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.read_bag import Progress, no_progress
@@ -160,12 +160,25 @@ class CorrectedScan:
 
 
 def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock | DistanceBlock]:
-    """The axes at the probe's samples, and the probe's blocks, as if one trigger had both."""
+    """The axes at the probe's samples, and the probe's blocks, as if one trigger had both.
+
+    A block that repeats samples or comes late has no axes; it is counted as what it is.
+    """
     axes, distance = [], []
     for _, block in bag.records(*TOPICS):
         if isinstance(block, AxisBlock):
             axes.append(block)
         elif isinstance(block, DistanceBlock):
             distance.append(block)
-    moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
-    yield from chain.from_iterable(zip(moved, distance, strict=True))
+    moved = iter(axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure))
+    at_probe = next(moved, None)
+    for block in distance:
+        if at_probe is not None and _same_samples(at_probe, block):
+            yield at_probe
+            at_probe = next(moved, None)
+        yield block
+
+
+def _same_samples(one: Block, other: Block) -> bool:
+    here, there = ((b.stamp_ns, b.first_sample, len(b)) for b in (one, other))
+    return here == there

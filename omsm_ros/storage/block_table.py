@@ -81,7 +81,9 @@ def long_blocks(kind: type, messages: Sequence[bytes]) -> Iterator[Any] | None:
     except struct_error:
         return None
     alike = all((table[name] == table[name][0]).all() for name in layout.lengths)
-    alike &= messages[0][:2] == _LITTLE_ENDIAN and CHANNELS[kind][0][0] in layout.fields
+    # What stands before the intensity, which may be empty as the status may, is always there.
+    needed = [name for name, channel in CHANNELS[kind] if channel is np.float64]
+    alike &= messages[0][:2] == _LITTLE_ENDIAN and all(name in layout.fields for name in needed)
     return _runs(kind, table) if alike else None
 
 

@@ -31,7 +31,9 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
         if len(raw) <= limit:
             return raw.decode("utf-8")
     except (OSError, UnicodeDecodeError) as err:
-        raise error(f"{what} {str(path)!r} cannot be read as text: {said(err)}") from err
+        raise error(
+            f"{what} {str(path)!r} cannot be read as text: {said(err)}; give a text in UTF-8"
+        ) from err
     raise error(
         f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "
         "check the path"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,9 @@ def load_motion(path: Path | str) -> tuple[FloatArray, float]:
     text = read_text(path, MAX_MOTION_BYTES, FileError, "motion")
     what = f"motion {str(path)!r}"
     try:
-        table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it is empty, which is said below
+            table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2)
     except ValueError as err:
         raise FileError(
             f"{what} is no table: {said(err)}; write a line 'time_s,z_m', then two numbers a line"

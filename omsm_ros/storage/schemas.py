@@ -47,7 +47,7 @@ def _said(found: jsonschema.ValidationError) -> str:
             return f"{shown(unknown)} is unknown, expected of {known}"
         case "required":
             missing = [name for name in wanted if name not in found.instance]  # type: ignore[operator, union-attr]
-            return f"{missing[0]} is required and missing"
+            return f"{missing[0]} is required and missing; write it there"
         case "type":
             kind = {"object": "names and values", "array": "a list"}.get(str(wanted), f"a {wanted}")
             return f"{said}, expected {kind}"

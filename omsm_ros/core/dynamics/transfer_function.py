@@ -55,7 +55,7 @@ class TransferFunction:
         if len(self.numerator) > len(self.denominator):
             raise DataError(
                 f"improper: numerator of degree {len(self.numerator) - 1}, "
-                f"denominator of degree {len(self.denominator) - 1}"
+                f"denominator of degree {len(self.denominator) - 1}, expected at least as many"
             )
         if not (np.isfinite(self.delay) and self.delay >= 0):
             raise DataError(f"delay {self.delay!r} s, expected zero or more")

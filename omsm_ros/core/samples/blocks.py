@@ -80,7 +80,10 @@ class Block:
         self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
     ) -> None:
         if len(lengths) != 1:
-            raise DataError(f"{name}: channels of different lengths {sorted(lengths)!r}")
+            raise DataError(
+                f"{name}: channels of different lengths {sorted(lengths)!r}, expected one; "
+                "check the driver that made it"
+            )
         (length,) = lengths
         if not 0 < length <= MAX_BLOCK_SAMPLES:
             raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")

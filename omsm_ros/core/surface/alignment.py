@@ -140,7 +140,8 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     residual = float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
     if not found.success or residual > 0.01 * abs(radius):
         raise DataError(
-            f"the scan does not fit a sphere of radius {radius!r} m: {residual!r} m are left"
+            f"the scan does not fit a sphere of radius {radius!r} m: {residual!r} m are left; "
+            "check the radius and its sign, and that the scan covers the sphere"
         )
     deviations = _standard_uncertainties(found.jac, found.fun)
     aligned = _with(start, found.x)

@@ -1,0 +1,109 @@
+"""What every command owes to every input, however hostile."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import resource
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros import cli
+from omsm_ros.storage.cloud_file import CloudFile
+
+LONGEST_S = 5.0
+MOST_BYTES = 1024**3
+# Words of a remedy: what a message says to do.
+REMEDIES = (
+    "check", "expected", "give", "use", "record", "identify", "write", "see", "call", "make",
+    "move", "remove", "sample", "look", "plan", "choose", "leave", "convert", "start", "both are",
+    "are needed", "at least", "more than", "set the", "needs", "must",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command line, and the files it is given by their names in the working folder."""
+
+    arguments: tuple[str, ...]
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def lay(self, folder: Path) -> None:
+        """Write the files into ``folder``."""
+        for name, content in self.files.items():
+            (folder / name).write_bytes(content)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command said."""
+
+    status: int
+    out: str
+    err: str
+    seconds: float
+
+
+def ask(case: Case, folder: Path) -> Answer:
+    """Run a command in this process, in ``folder``."""
+    case.lay(folder)
+    out, err = io.StringIO(), io.StringIO()
+    before = os.getcwd()
+    os.chdir(folder)
+    start, held = time.monotonic(), peak_bytes()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = cli.main(list(case.arguments))
+    finally:
+        os.chdir(before)
+    grown = peak_bytes() - held
+    assert grown < MOST_BYTES, f"took {grown / 1e6:.0f} MB more"
+    return Answer(status, out.getvalue(), err.getvalue(), time.monotonic() - start)
+
+
+def peak_bytes() -> int:
+    """Largest memory this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def judge(case: Case, answer: Answer, folder: Path) -> None:
+    """Fail unless the answer is a refusal in one line that helps, or right."""
+    said = f"{answer.status}: {answer.err!r} {answer.out[:300]!r}"
+    assert answer.seconds < LONGEST_S, f"took {answer.seconds:.1f} s, {said}"
+    assert answer.status in (0, 2), said
+    assert "Traceback" not in answer.err, said
+    if answer.status == 2:
+        assert answer.err.count("\n") == 1, said
+        assert answer.err.startswith("omsm: "), said
+        assert 20 < len(answer.err) < 2000, said
+        assert any(word in answer.err for word in REMEDIES), said
+    leftovers = [name for name in os.listdir(folder) if name.endswith(".part")]
+    assert not leftovers, leftovers
+    if answer.out and "--json" in case.arguments:
+        facts = json.loads(answer.out, parse_constant=_no_constant)
+        assert isinstance(facts, dict), said
+        if answer.status == 0:
+            _check(facts, folder)
+
+
+def _no_constant(name: str) -> float:
+    raise AssertionError(f"{name} is no JSON")
+
+
+def _check(facts: dict[str, object], folder: Path) -> None:
+    """Samples are accounted for, and what stands in a cloud is a number."""
+    samples = facts.get("samples")
+    if isinstance(samples, dict):
+        for account in samples.values():
+            assert account["received"] == account["corrected"] + sum(account["counted"].values())
+        if (folder / "out" / "cloud.ply").exists():
+            cloud = CloudFile(folder / "out" / "cloud.ply").read()
+            assert len(cloud) == samples["axes"]["corrected"]
+            for name in ("x", "y", "height", "dynamic_error", "uncertainty"):
+                assert np.isfinite(cloud[name]).all(), name
+            assert (cloud["uncertainty"] >= 0).all()
