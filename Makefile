@@ -31,8 +31,9 @@ lint: setup
 	$(RUN) ruff format --check .
 	$(RUN) if python -c "$(NUMPY_TYPED)"; then mypy; fi
 
+# Ten minutes; `make bench FULL=1` has all runs and long recordings, for an hour.
 bench: $(PEERS)
-	$(RUN) python -m benchmarks
+	$(RUN) python -m benchmarks $(if $(FULL),--full)
 
 soak: setup
 	$(RUN) python -m pytest -m soak --timeout=0

@@ -1,4 +1,6 @@
-"""All benchmarks, one table, ``out/bench.json``: ``python -m benchmarks [part …]``.
+"""All benchmarks, one table, ``out/bench.json``: ``python -m benchmarks [--full] [part …]``.
+
+Without ``--full`` there are fewer runs of each study, so wider bars; each line says how many.
 
 Ends with exit status 1 if a bar is not cleared.
 """
@@ -23,7 +25,7 @@ def show(row: Row) -> None:
     peer = row["peer"]
     against = f"{peer:.4g}" if isinstance(peer, float) else peer or ""
     print(
-        f"{mark:<6}{row['name']:<62}{row['value']:>12.4g} {row['unit']:<9}"
+        f"{mark:<6}{row['name']:<72}{row['runs'] or '':>5}{row['value']:>12.4g} {row['unit']:<6}"
         f"{row['bar']:<16}{against}",
         flush=True,
     )
@@ -33,15 +35,17 @@ def main() -> int:
     """Run the parts asked for, all by default."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("parts", nargs="*", default=PARTS, metavar="part", help=", ".join(PARTS))
+    parser.add_argument("--full", action="store_true", help="all runs: three quarters of an hour")
     parser.add_argument("--out", type=Path, default=Path("out/bench.json"))
     args = parser.parse_args()
     unknown = sorted(set(args.parts) - set(PARTS))
     if unknown:
         parser.error(f"no part {unknown}, expected {', '.join(PARTS)}")
     found: list[Row] = []
+    print(f"{'':6}{'figure':72}{'runs':>5}{'value':>12} {'':6}{'bar':16}peer")
     for part in args.parts:
         begin = time.monotonic()
-        for row in importlib.import_module(f"benchmarks.{part}").rows():
+        for row in importlib.import_module(f"benchmarks.{part}").rows(args.full):
             found.append(row)
             show(row)
         print(f"      {part}: {time.monotonic() - begin:.0f} s", flush=True)

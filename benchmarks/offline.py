@@ -74,8 +74,9 @@ def _correct(folder: Path, bag: str) -> tuple[float, float]:
     return time.perf_counter() - begin, usage.ru_maxrss * 1024 / 2**30
 
 
-def rows(long_points: int = LONG_POINTS) -> Iterator[Row]:
+def rows(full: bool) -> Iterator[Row]:
     """Bag to cloud of the paper's scan, of ten times it, and of a very long one."""
+    long_points = LONG_POINTS if full else LONG_POINTS // 10
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _calibration(folder / "cal.json")

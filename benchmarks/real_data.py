@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from scipy import io as scipy_io
 
-from benchmarks.row import Row, at_least
+from benchmarks.row import Row, at_least, shown
 from omsm_ros.core.identification.held_command import identify_held
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -249,8 +249,9 @@ def table() -> list[dict[str, object]]:
     return rows
 
 
-def rows() -> list[Row]:
+def rows(full: bool) -> list[Row]:
     """Ours against the best peer at each order; the order 0 is chosen automatically."""
+    del full  # it takes a minute
     if not DATA.is_dir():
         print(f"real data: skipped, {DATA} is absent")
         return []
@@ -272,7 +273,7 @@ def _against_peers(same: list[dict[str, object]]) -> Row:
     name, value = f"{own['record']}, {order}", float(str(own["score"]))
     peers = [r for r in same if r is not own]
     if not peers:
-        return Row(name=name, value=value, unit="%", peer=None, bar="no peer", holds=None)
+        return shown(name, value, "%", "no peer")
     best = max(peers, key=lambda r: float(str(r["score"])))
     bar, peer = max((float(str(best["score"])), str(best["method"])), (0.0, "the mean"))
     return at_least(name, value, "%", bar, peer)

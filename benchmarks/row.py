@@ -8,7 +8,7 @@ from typing import TypedDict
 class Row(TypedDict):
     """A measured figure and the bar it has to clear.
 
-    name: what was measured;  value, unit: the figure
+    name: what was measured;  value, unit: the figure;  runs: over which it was taken, if several
     peer: the figure of what it is measured against, or its name, or None
     bar: the condition in words;  holds: whether it is met, None where nothing could be compared
     """
@@ -16,40 +16,69 @@ class Row(TypedDict):
     name: str
     value: float
     unit: str
+    runs: int | None
     peer: float | str | None
     bar: str
     holds: bool | None
 
 
 def at_most(
-    name: str, value: float, unit: str, limit: float, peer: float | str | None = None
+    name: str,
+    value: float,
+    unit: str,
+    limit: float,
+    peer: float | str | None = None,
+    runs: int | None = None,
 ) -> Row:
     """A figure that must not exceed ``limit``."""
-    value = float(value)
-    return Row(
-        name=name, value=value, unit=unit, peer=peer, bar=f"<= {limit:g}", holds=value <= limit
-    )
+    return _row(name, value, unit, runs, peer, f"<= {limit:g}", float(value) <= limit)
 
 
 def at_least(
-    name: str, value: float, unit: str, limit: float, peer: float | str | None = None
+    name: str,
+    value: float,
+    unit: str,
+    limit: float,
+    peer: float | str | None = None,
+    runs: int | None = None,
 ) -> Row:
     """A figure that must reach ``limit``."""
-    value = float(value)
-    return Row(
-        name=name, value=value, unit=unit, peer=peer, bar=f">= {limit:g}", holds=value >= limit
-    )
+    return _row(name, value, unit, runs, peer, f">= {limit:g}", float(value) >= limit)
 
 
 def between(
-    name: str, value: float, unit: str, low: float, high: float, peer: float | str | None = None
+    name: str,
+    value: float,
+    unit: str,
+    low: float,
+    high: float,
+    peer: float | str | None = None,
+    runs: int | None = None,
 ) -> Row:
     """A figure that must lie within ``low`` and ``high``."""
-    value = float(value)
-    bar, holds = f"{low:g} to {high:g}", low <= value <= high
-    return Row(name=name, value=value, unit=unit, peer=peer, bar=bar, holds=holds)
+    holds = low <= float(value) <= high
+    return _row(name, value, unit, runs, peer, f"{low:g} to {high:g}", holds)
+
+
+def shown(
+    name: str, value: float, unit: str, peer: float | str | None = None, runs: int | None = None
+) -> Row:
+    """A figure without a bar, for whoever reads the others beside it."""
+    return _row(name, value, unit, runs, peer, "", None)
 
 
 def not_compared(name: str, unit: str, bar: str, why: str) -> Row:
     """A figure that could not be had here."""
-    return Row(name=name, value=float("nan"), unit=unit, peer=why, bar=bar, holds=None)
+    return _row(name, float("nan"), unit, None, why, bar, None)
+
+
+def _row(
+    name: str,
+    value: float,
+    unit: str,
+    runs: int | None,
+    peer: float | str | None,
+    bar: str,
+    holds: bool | None,
+) -> Row:
+    return Row(name=name, value=float(value), unit=unit, runs=runs, peer=peer, bar=bar, holds=holds)

@@ -73,15 +73,8 @@ CLOUD_FIELDS: tuple[tuple[str, str], ...] = (
 )
 """Name and little-endian type of each field; lengths in metres."""
 
-# Eight-byte alignment: viewers cast pointers into the buffer.
-POINT_DTYPE = np.dtype(
-    {
-        "names": [name for name, _ in CLOUD_FIELDS],
-        "formats": [kind for _, kind in CLOUD_FIELDS],
-        "offsets": [0, 4, 8, 16, 24, 28, 32, 36],
-        "itemsize": 40,
-    }
-)
+# Aligned as a C compiler would: viewers cast pointers into the buffer.
+POINT_DTYPE = np.dtype(list(CLOUD_FIELDS), align=True)
 """One point of a PointCloud2 message."""
 
 
@@ -91,9 +84,8 @@ def pack_points(points: SurfacePoints, dtype: np.dtype[np.void] = POINT_DTYPE) -
     z repeats height for viewers.
     """
     packed = np.zeros(len(points), dtype)
-    packed["z"] = points.height
     # The counter of the trigger is 64 bits wide; a cloud keeps its low half.
-    packed["sample"] = points.sample & 0xFFFFFFFF
-    for name in ("x", "y", "height", "dynamic_error", "uncertainty", "intensity"):
-        packed[name] = getattr(points, name)
+    special = {"z": points.height, "sample": points.sample & 0xFFFFFFFF}
+    for name, _ in CLOUD_FIELDS:
+        packed[name] = special[name] if name in special else getattr(points, name)
     return packed

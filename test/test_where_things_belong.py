@@ -1,0 +1,213 @@
+"""What a newcomer adds goes into one room, and is then everywhere: each is added here, and seen.
+
+The answers in words stand in docs/design/where-things-belong.md.
+"""
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import omsm_ros
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
+from omsm_ros.core.identification.covariance_terms import CovarianceTerm
+from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.surface import nominal
+from omsm_ros.storage import machine_files
+
+PACKAGE = Path(omsm_ros.__file__).resolve().parent
+
+
+@pytest.fixture
+def motion(step_test):
+    return assemble([step_test.axes], [step_test.distance])
+
+
+# ----------------------------------------------------------------------- a nominal surface
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """Bent along x."""
+
+    curvature: float
+
+    def height(self, x, y):
+        return 0.5 * self.curvature * np.square(x) + 0.0 * y
+
+
+def test_a_nominal_surface_is_added_in_core_surface(monkeypatch, tmp_path):
+    """One entry of SHAPES: its YAML has the names of its fields, and bad ones are refused."""
+    monkeypatch.setitem(nominal.SHAPES, "cylinder", Cylinder)
+    files = importlib.reload(machine_files)
+    path = tmp_path / "surface.yaml"
+    path.write_text("shape: cylinder\ncurvature: 2.0\n")
+    assert files.load_surface(path).height(np.array([3.0]), np.array([1.0])) == [9.0]
+    path.write_text("shape: cylinder\nradius: 2.0\n")
+    with pytest.raises(omsm_ros.errors.SurfaceError, match="radius"):
+        files.load_surface(path)
+
+
+@pytest.fixture(autouse=True)
+def shapes_as_they_were():
+    yield
+    importlib.reload(machine_files)
+
+
+# ------------------------------------------------------------- a residual test, a further doubt
+
+
+def test_a_residual_test_is_added_in_core_identification(monkeypatch, motion):
+    """One entry of CHECKS: it sees the residual; its words, limits and verdict are certified."""
+
+    def skewed(evidence):
+        residual = evidence.fit.residual
+        skew = float(np.mean(residual**3) / np.mean(residual**2) ** 1.5)
+        return Finding({"skewness": skew}, {"skewness": 0.0}, ("skewed",), ("look at it",))
+
+    monkeypatch.setattr(identify, "CHECKS", (*checks.CHECKS, skewed))
+    certificate = identify.identify(motion, order=2).calibration.certificate
+    assert abs(certificate["skewness"]) < 0.1
+    assert certificate["limits"]["skewness"] == 0.0
+    assert certificate["verdict"] == "rejected"
+    assert certificate["reasons"] == ["skewed"]
+    assert "look at it" in certificate["warnings"]
+
+
+def test_what_the_data_cannot_show_is_added_in_core_identification(monkeypatch, motion):
+    """One entry of COVARIANCE_TERMS: the covariance and every band widen by it."""
+    before = identify.identify(motion, order=2).calibration
+
+    def doubt(prepared, fit, from_noise):
+        further = np.zeros_like(from_noise)
+        further[-1, -1] = (100e-6) ** 2
+        return CovarianceTerm(further, Finding({"doubt_s": 100e-6}))
+
+    every = (*covariance_terms.COVARIANCE_TERMS, doubt)
+    monkeypatch.setattr(response_uncertainty, "COVARIANCE_TERMS", every)
+    after = identify.identify(motion, order=2).calibration
+    added = after.covariance - before.covariance
+    assert added[-1, -1] == pytest.approx(1e-8)
+    assert np.count_nonzero(added) == 1
+    assert after.certificate["doubt_s"] == 100e-6
+
+
+# ----------------------------------------------------------------------- an uncertainty source
+
+
+@pytest.mark.parametrize("source", [field.name for field in fields(ErrorSources)])
+def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibration, small_scan):
+    """Every field of ErrorSources reaches the points and the budget, alone and under its name."""
+    part = slice(0, 3000)
+    axes, distance = (
+        replace(block, **{name: getattr(block, name)[part] for name in names})
+        for block, names in (
+            (small_scan.axes, "xyzbc"),
+            (small_scan.distance, ("distance", "intensity", "status")),
+        )
+    )
+
+    def corrected(**sources):
+        options = CorrectionOptions(sources=ErrorSources(**sources))
+        corrector = Corrector(true_calibration, options)
+        corrector.push_axes(axes)
+        corrector.push_distance(distance)
+        return join_points([corrector.finish()]), corrector.budget
+
+    points, budget = corrected(**{source: 1e-6})
+    silent, nothing = corrected()
+    assert not any(nothing.values())
+    assert {name for name, value in budget.items() if value} == {source}
+    assert np.all(silent.uncertainty == 0)
+    mean_square = np.mean(np.square(points.uncertainty))
+    assert mean_square > 0
+    assert budget[source] == pytest.approx(np.sqrt(mean_square), rel=1e-6)
+
+
+# ------------------------------------------- what needs another source: tried on a copy of it
+
+
+def changed_copy(folder, path, *changes):
+    """The package with some text of one file replaced; returns how to run Python with it."""
+    copy = folder / "omsm_ros"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE.parent / "msg_defs", folder / "msg_defs")
+    text = (copy / path).read_text(encoding="utf-8")
+    for old, new in changes:
+        assert text.count(old) == 1, f"{old!r} in {path}"
+        text = text.replace(old, new)
+    (copy / path).write_text(text, encoding="utf-8")
+
+    def run(*arguments):
+        command = f"import sys; sys.path.insert(0, {str(folder)!r}); "
+        done = subprocess.run(
+            [sys.executable, "-c", command + arguments[0], *arguments[1:]],
+            capture_output=True,
+            text=True,
+            cwd=folder,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_a_column_of_the_cloud_is_added_in_core_correction(tmp_path):
+    """One line where it is laid out, and one where it is computed: file and message have it."""
+    run = changed_copy(
+        tmp_path,
+        "core/correction/surface_points.py",
+        ('("sample", "<u4"),\n)', '("sample", "<u4"),\n    ("slope", "<f8"),\n)'),
+        ("    uncertainty: FloatArray\n", "    uncertainty: FloatArray\n    slope: FloatArray\n"),
+    )
+    script = """
+import json, sys
+import numpy as np
+from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
+from omsm_ros.storage.cloud_file import CloudFile, PlyWriter
+from omsm_ros.storage.conversions import Messages, cloud_array, cloud_message
+from types import SimpleNamespace
+names = "x y height dynamic_error uncertainty intensity slope".split()
+made = SurfacePoints(sample=np.arange(3), **{n: np.arange(3.0) for n in names})
+with PlyWriter("cloud.ply") as writer:
+    writer.write(made)
+kinds = dict.fromkeys(("Time", "Header", "PointCloud2", "PointField"), SimpleNamespace)
+messages = Messages(kinds, lambda values, dtype: np.asarray(values, dtype).tobytes())
+message = cloud_message(messages, pack_points(made), 0)
+print(json.dumps({
+    "file": CloudFile("cloud.ply").read()["slope"].tolist(),
+    "message": cloud_array(message)["slope"].tolist(),
+    "fields": [field.name for field in message.fields],
+}))
+"""
+    answer = json.loads(run(f"exec({script!r})"))
+    assert answer["file"] == answer["message"] == [0.0, 1.0, 2.0]
+    assert answer["fields"][-1] == "slope"
+
+
+def test_an_offline_command_is_added_in_cli(tmp_path):
+    """A module with COMMANDS, and its words: help, --json and exit status come with it."""
+    run = changed_copy(
+        tmp_path,
+        "cli/main.py",
+        ("WORDS = {\n", 'WORDS = {\n    "omsm_ros.cli.weighing": ("weigh",),\n'),
+    )
+    (tmp_path / "omsm_ros" / "cli" / "weighing.py").write_text(
+        "from omsm_ros.cli.command import Command\n"
+        "def declare(parser):\n    parser.add_argument('grams', type=float)\n"
+        "COMMANDS = [Command('weigh', 'what it weighs', declare,\n"
+        "    lambda args: {'kg': args.grams / 1000}, print)]\n"
+    )
+    main = "from omsm_ros.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    assert json.loads(run(main, "weigh", "--json", "250")) == {"kg": 0.25}
+    assert "what it weighs" in run(main, "--help")
