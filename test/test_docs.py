@@ -1,0 +1,48 @@
+"""What the documents point at exists."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import omsm_ros
+
+ROOT = Path(omsm_ros.__file__).resolve().parent.parent
+PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+
+
+def named(page):
+    """Files that a page links to, or names in code as a path of this tree."""
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+        if "://" not in target:
+            yield page.parent / target
+    for name in re.findall(r"`([\w./]+\.(?:py|yaml|md))`", text):
+        if "/" in name:
+            yield next(
+                (b / name for b in (ROOT, ROOT / "omsm_ros") if (b / name).exists()), Path(name)
+            )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_points_at_exists(page):
+    missing = [str(path) for path in named(page) if not path.exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_heading_that_is_pointed_at_exists(page):
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", text):
+        other = (page.parent / target) if target else page
+        headings = re.findall(r"^#+ (.+)$", other.read_text(encoding="utf-8"), re.MULTILINE)
+        anchors = {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+        assert anchor in anchors
+
+
+def test_every_command_of_the_readme_exists():
+    from omsm_ros.cli.main import WORDS
+
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"^\| `omsm (\w+)", readme, re.MULTILINE))
+    assert named == {word for words in WORDS.values() for word in words} | {"demo"}
