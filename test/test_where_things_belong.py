@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import omsm_ros
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm

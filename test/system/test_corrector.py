@@ -208,8 +208,8 @@ def test_predict_error_of_a_sine_is_that_of_its_frequency(cell, true_calibration
 
 def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     """Bit for bit, whatever was between: messages, DDS, blocks."""
-    from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, join_points
-    from omsm_ros.core.correction.surface_points import pack_points
+    from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+    from omsm_ros.core.correction.surface_points import join_points, pack_points
     from omsm_ros.core.correction.uncertainty import sources_with
 
     cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))

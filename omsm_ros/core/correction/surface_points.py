@@ -50,14 +50,9 @@ def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
     )
 
 
+_KINDS = {"sample": np.int64, "intensity": np.float32}
 _NO_POINTS = SurfacePoints(
-    sample=np.empty(0, np.int64),
-    x=np.empty(0),
-    y=np.empty(0),
-    height=np.empty(0),
-    dynamic_error=np.empty(0),
-    uncertainty=np.empty(0),
-    intensity=np.empty(0, np.float32),
+    **{f.name: np.empty(0, _KINDS.get(f.name, np.float64)) for f in fields(SurfacePoints)}
 )
 
 
