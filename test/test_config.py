@@ -14,8 +14,8 @@ from omsm_ros.devices.factory import PARAMETERS
 from omsm_ros.storage.machine_files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
-SURFACES = {"paper_mirror"}
-NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - SURFACES)
+NO_PARAMETERS = {"paper_mirror", "disturbances"}
+NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PARAMETERS)
 
 
 def _declared(node):

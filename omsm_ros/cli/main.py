@@ -52,6 +52,7 @@ def _parser(word: str) -> argparse.ArgumentParser:
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
     demo.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
     demo.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
+    demo.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
     demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
     return parser
 
@@ -61,6 +62,7 @@ def _demo(args: argparse.Namespace) -> int:
     command = [sys.executable, "-m", "omsm_ros.nodes.cell_demo_node", "--out", str(args.out)]
     command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]
     command += ["--device", args.device]
+    command += ["--disturbances", args.disturbances] if args.disturbances else []
     return subprocess.call([*command, *(["--json"] if args.json else [])])
 
 

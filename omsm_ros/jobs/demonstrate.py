@@ -16,7 +16,6 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.surface import deviation as form
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.emulators.players import emulated
@@ -31,10 +30,12 @@ from omsm_ros.report.measurement.gallery import surface_figures
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
 from omsm_ros.twin.cell import Probe, Recording
-from omsm_ros.twin.plant import Plant
+from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, scan_of, spiral_of, step_test_of
+from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.truth import TruthComparison, departure_from_truth
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 
@@ -52,6 +53,7 @@ class Demonstration:
 
     time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
     device: what the emulated probe speaks
+    disturbance_file: what is wrong with the machine, None for nothing
     """
 
     out: Path
@@ -59,6 +61,7 @@ class Demonstration:
     time_lapse: float = 20.0
     start_radius: float = 12.7e-3
     device: str = "six_channel"
+    disturbance_file: Path | None = None
     sample_period: float = field(default=1e-3, init=False)
 
     @cached_property
@@ -67,6 +70,11 @@ class Demonstration:
         return Scenario(
             seed=self.seed, start_radius=self.start_radius, sample_period=self.sample_period
         )
+
+    @cached_property
+    def disturbances(self) -> Disturbances:
+        """What is wrong with the machine."""
+        return load_disturbances(self.disturbance_file) if self.disturbance_file else NOTHING
 
     @property
     def calibration_file(self) -> Path:
@@ -88,7 +96,7 @@ class Demonstration:
     @property
     def step_test_samples(self) -> int:
         """Samples of the step test."""
-        return len(step_test_of(self.scenario).axes)
+        return len(step_test_of(self.scenario, self.disturbances).axes)
 
     @property
     def scan_samples(self) -> int:
@@ -103,6 +111,7 @@ class Demonstration:
             "seed": self.seed,
             "start_radius": self.start_radius,
             "sample_period": self.sample_period,
+            "disturbances": str(self.disturbance_file.absolute()) if self.disturbance_file else "",
         }
 
     def driver_parameters(self) -> dict[str, object]:
@@ -121,6 +130,7 @@ class Demonstration:
 
     def prepare(self) -> None:
         """Make the folder and clear it of an earlier run's results."""
+        _ = self.disturbances  # a file that cannot be read is told before anything is cleared
         self.out.mkdir(parents=True, exist_ok=True)
         stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
         for path in stale:
@@ -143,12 +153,13 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
-    recording = scan_of(plan.scenario)
+    recording = scan_of(plan.scenario, plan.disturbances)
+    step_test = step_test_of(plan.scenario, plan.disturbances)
     summary = measurement.summarise(plan.bag, done, calibration)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
-    summary["response"] = response_errors(calibration, Plant().dynamics)
+    summary["response"] = response_errors(calibration, true_response(step_test))
     summary["live_equals_offline"] = same_points(live_points(plan.bag), cloud)
     index = cloud["sample"].astype(np.int64)
     figures = surface_figures(
@@ -157,8 +168,8 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
         true_height=recording.surface_height[index],
         true_error_left=(recording.probe_motion - recording.axes.z)[index] + view.dynamic_error,
     )
-    figures |= calibration_figures(calibration, step_test_of(plan.scenario))
-    (plan.out / OVERVIEW).write_bytes(overview(view, calibration))
+    figures |= calibration_figures(calibration, step_test)
+    (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true_response(step_test)))
     save_json(plan.out / SUMMARY, summary)
     publication.publish(plan.out, TITLE, summary, calibration, figures)
     return summary
@@ -176,7 +187,14 @@ def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, An
     return entries
 
 
-def response_errors(calibration: Calibration, true: TransferFunction) -> list[dict[str, float]]:
+def true_response(recording: Recording) -> TrueResponse:
+    """What an identification should have found."""
+    if recording.truth is None:
+        raise OmsmError("this recording comes without the truth behind it; record it on the twin")
+    return recording.truth.response
+
+
+def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[str, float]]:
     """Identified against true response: relative gain error [1], phase error [deg]."""
     frequency = np.array(RESPONSE_FREQUENCIES_HZ)
     ratio = calibration.dynamics.response(frequency) / true.response(frequency)
@@ -187,14 +205,14 @@ def response_errors(calibration: Calibration, true: TransferFunction) -> list[di
     ]
 
 
-def overview(view: CloudView, calibration: Calibration) -> bytes:
+def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
     """One wide picture: map before in µm, after in nm, identified and true response."""
     weights = form.spiral_weights(view.x, view.y)
     raw, corrected = (
         form.level(view.x, view.y, form.deviation(view.x, view.y, h, PAPER_MIRROR), weights=weights)
         for h in (view.raw_height, view.height)
     )
-    figure = overview_figure(view.x, view.y, raw, corrected, calibration, Plant().dynamics)
+    figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
     return style.png(figure, dpi=120)
 
 
@@ -223,7 +241,7 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
         -step.distance.distance / calibration.static_gain,
         recursion.run(axes.z),
     )
-    bode = response_figures.bode(calibration, Plant().dynamics, period)
+    bode = response_figures.bode(calibration, true_response(step), period)
     return {"bode": style.png(bode), "step_response": style.png(edges)}
 
 

@@ -203,6 +203,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, default=12.7e-3, help="[m]")
+    parser.add_argument("--disturbances", type=Path, help="what is wrong with the machine")
     parser.add_argument("--json", action="store_true")
     # What follows --ros-args is for rclpy, when started by `ros2 run`.
     return parser.parse_args(rclpy.utilities.remove_ros_args(sys.argv)[1:])
@@ -220,6 +221,7 @@ def main() -> None:
         time_lapse=args.time_lapse,
         start_radius=args.start_radius,
         device=args.device,
+        disturbance_file=args.disturbances,
     )
     stage = Stage(quiet=args.json)
     rclpy.init()

@@ -11,6 +11,8 @@ from omsm_ros.emulators.generic_stream import Faults
 from omsm_ros.emulators.players import emulated, line_for
 from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.nodes.running import NAMESPACE, OK, Diagnostics, parameter, run
+from omsm_ros.storage.disturbance_file import load_disturbances
+from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
 
@@ -39,6 +41,8 @@ class CellEmulatorNode(Node):
             step_rise=parameter(self, "step_rise", 20e-3, "edge of the step test [s], 0 = sharp"),
             sample_period=parameter(self, "sample_period", 1e-3, "of the trigger [s]"),
         )
+        file = parameter(self, "disturbances", "", "file of what is wrong with the machine")
+        self._disturbances = load_disturbances(file) if file else NOTHING
         faults = Faults(
             seed=self._scenario.seed,
             noise=parameter(self, "fault_noise", 0.0, "noise burst before a frame, probability"),
@@ -60,7 +64,7 @@ class CellEmulatorNode(Node):
             response.success, response.message = False, "a motion is running; stop it first"
             return response
         try:
-            recording = motion_of(self._scenario)
+            recording = motion_of(self._scenario, self._disturbances)
         except OmsmError as err:
             response.success, response.message = False, str(err)
             return response

@@ -11,9 +11,13 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, DistanceBlock, FloatArray, Status
-from omsm_ros.twin.quantities import check_numbers
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.record_checks import check_numbers
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
+
+# No accelerometer has content beyond 100 kHz.
+_SHORTEST_PERIOD_S = 5e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +36,12 @@ class ReferenceSensor:
     cubic_m: float = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("half_range_m",), not_negative=("latency_s", "noise_m"))
+        check_numbers(
+            self,
+            positive=("half_range_m",),
+            not_negative=("latency_s", "noise_m"),
+            lags=("latency_s",),
+        )
 
     def read(
         self, carriage: Trajectory, time: FloatArray, period: float, random: np.random.Generator
@@ -71,6 +80,11 @@ class Accelerometer:
         check_numbers(
             self, positive=("sample_period_s", "high_pass_hz"), not_negative=("noise_m_per_s2",)
         )
+        if self.sample_period_s is not None and self.sample_period_s < _SHORTEST_PERIOD_S:
+            raise ConfigurationError(
+                f"Accelerometer: sample_period_s is {self.sample_period_s!r}, expected "
+                f"{_SHORTEST_PERIOD_S:g} or more"
+            )
 
     def read(
         self,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.units import PPM
 
 # No draw of a normal distribution lies beyond this many sigma in a billion.
@@ -45,7 +45,9 @@ class ClockErrors:
     c_latch_late_s: float = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers(self, not_negative=("trigger_jitter_s", "probe_jitter_s"))
+        jitter = ("trigger_jitter_s", "probe_jitter_s")
+        late = ("probe_offset_s", "z_latch_late_s", "c_latch_late_s")
+        check_numbers(self, not_negative=jitter, lags=(*jitter, *late))
 
     @property
     def lag_s(self) -> float:

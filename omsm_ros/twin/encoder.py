@@ -12,7 +12,7 @@ from scipy import signal
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.units import PPM
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.record_checks import check_numbers, is_default
 
 # Each turn of the iteration leaves tilt times slope, at most a hundredth, of the error before;
 # it ends when nothing changes beyond rounding of a millimetre [m].

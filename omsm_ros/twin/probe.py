@@ -11,7 +11,7 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
-from omsm_ros.twin.quantities import check_numbers
+from omsm_ros.twin.record_checks import LONGEST_LAG_S, check_numbers
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # Gauss-Legendre on four points is exact to the seventh power of time within an exposure: within
@@ -72,10 +72,12 @@ class ProbeErrors:
             self,
             positive=("period_m", "intensity_slope_rad", "dropout_slope_rad"),
             not_negative=("latency_s", "exposure_s", "noise_m", "dropout_probability"),
+            lags=("latency_s", "exposure_s"),
         )
-        if self.averages < 1:
+        if self.averages < 1 or self.window_s > LONGEST_LAG_S:
             raise ConfigurationError(
-                f"ProbeErrors: averages is {self.averages!r}, expected 1 or more"
+                f"ProbeErrors: averages is {self.averages!r}, exposure_s {self.exposure_s!r}; "
+                f"expected 1 or more, and {LONGEST_LAG_S:g} s at most together"
             )
         if self.dropout_probability > 1:
             raise ConfigurationError(

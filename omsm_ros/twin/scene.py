@@ -17,7 +17,7 @@ from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part_pose import posed
 from omsm_ros.twin.plant import Grid, Plant, move
-from omsm_ros.twin.quantities import is_default
+from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.structure import deform
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.twin.vibration import Vibration

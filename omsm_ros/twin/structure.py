@@ -19,14 +19,17 @@ from scipy import signal
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.machine.trajectories import s_curve
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import Movement
-from omsm_ros.twin.quantities import check_numbers, is_default
+from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.trajectory import Trajectory
 
 # The machine comes to its motion within this time, so that a soft mode is not struck.
 _SPIN_UP_S = 4.0
 # Two relaxations a decade lie within 0.5 % of a straight line in the logarithm of time.
 _RELAXATIONS_PER_DECADE = 2
+# What is faster than this is no creep [s].
+_SHORTEST_RELAXATION_S = 1e-4
 # A change smaller than this between two steps is rounding, not a reversal [m].
 _STILL_M = 1e-16
 
@@ -58,6 +61,11 @@ class LogCreep:
 
     def __post_init__(self) -> None:
         check_numbers(self, positive=("shortest_s", "longest_s"))
+        if not _SHORTEST_RELAXATION_S <= self.shortest_s <= self.longest_s:
+            raise ConfigurationError(
+                f"LogCreep: from {self.shortest_s!r} to {self.longest_s!r} s, expected to begin at "
+                f"{_SHORTEST_RELAXATION_S:g} s or later and to end after that"
+            )
 
     @property
     def relaxations(self) -> tuple[Creep, ...]:

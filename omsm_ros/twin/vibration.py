@@ -13,7 +13,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.quantities import check_numbers
+from omsm_ros.twin.record_checks import check_numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

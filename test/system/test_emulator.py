@@ -1,7 +1,13 @@
 """The emulator's buttons: a motion is started, refused while another runs, and stopped."""
 
+import subprocess
+import sys
+
 import pytest
+from omsm_msgs.msg import AxisBlock
 from std_srvs.srv import Trigger
+
+from omsm_ros.nodes.running import SAMPLES_QOS
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -34,3 +40,32 @@ def test_stop_without_a_motion_does_no_harm(cell):
     assert answer.success
     assert answer.message == "0 samples played"
     cell.processes.check()
+
+
+def test_the_file_of_disturbances_is_played(cell):
+    """An encoder that reads one per cent too long, seen at the driver's end of the wire."""
+    file = cell.folder / "disturbances.yaml"
+    file.write_text("encoder: {scale_ppm: 10000}\n")
+    cell.start_emulator(disturbances=str(file))
+    cell.processes.start("confocal_driver", port=cell.link)
+    blocks = []
+    cell.operator.create_subscription(AxisBlock, "/omsm/axes", blocks.append, SAMPLES_QOS)
+    cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)
+    cell.wait("us", lambda: cell.operator.value("confocal_driver", "axes_subscribers") >= 1)
+    assert cell.call(Trigger, "cell_emulator/step_test").success
+    cell.wait("all of it", lambda: sum(len(block.z) for block in blocks) >= 10_500)
+    highest = max(max(block.z) for block in blocks)
+    assert highest == pytest.approx(98e-6 * 1.01, abs=0.05e-6)
+
+
+def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
+    file = tmp_path / "disturbances.yaml"
+    file.write_text("probe: {latency: 1e-3}\n")
+    command = [sys.executable, "-m", "omsm_ros.nodes.cell_emulator_node", "--ros-args"]
+    ended = subprocess.run(
+        [*command, "-p", f"disturbances:={file}"], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 2
+    (line,) = ended.stderr.strip().splitlines()
+    assert "disturbances.yaml" in line
+    assert "'latency' is unknown" in line

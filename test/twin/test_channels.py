@@ -128,5 +128,7 @@ def test_it_has_noise_and_cross_talk():
 def test_sizes_that_cannot_be_are_named():
     with pytest.raises(ConfigurationError, match="sample_period_s"):
         Accelerometer(sample_period_s=0.0)
+    with pytest.raises(ConfigurationError, match="5e-06 or more"):
+        Accelerometer(sample_period_s=1e-9)
     with pytest.raises(ConfigurationError, match="half_range_m"):
         ReferenceSensor(half_range_m=-1.0)

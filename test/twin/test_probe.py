@@ -104,7 +104,11 @@ def test_what_sees_no_slope_says_so():
     ("wrong", "name"),
     [
         ({"exposure_s": -1e-3}, "exposure_s"),
+        ({"exposure_s": 2.0}, "exposure_s"),
         ({"averages": 0}, "averages"),
+        ({"averages": 20, "exposure_s": 0.1}, "1 s at most together"),
+        ({"latency_s": 1e9}, "latency_s"),
+        ({"periodic_m": 20.0}, "check its unit"),
         ({"dropout_probability": 1.5}, "dropout_probability"),
         ({"intensity_slope_rad": 0.0}, "intensity_slope_rad"),
         ({"cubic_m": np.nan}, "cubic_m"),

@@ -161,6 +161,8 @@ def test_stiffness_changes_the_deflection_along_x():
         (lambda: StructureErrors(hardening_deflection_m=0.0), "hardening_deflection_m"),
         (lambda: Creep(fraction=1e-3, time_constant_s=0.0), "time_constant_s"),
         (lambda: Creep(fraction=np.nan, time_constant_s=1.0), "fraction"),
+        (lambda: LogCreep(fraction_per_decade=1e-3, shortest_s=1.0, longest_s=0.1), "LogCreep"),
+        (lambda: LogCreep(fraction_per_decade=1e-3, shortest_s=1e-9), "LogCreep"),
         (lambda: Friction(drag_m=1e-9, presliding_m=-1.0), "presliding_m"),
         (lambda: SoftMode(frequency_hz=0.0, damping_ratio=0.1, participation=0.1), "frequency_hz"),
     ],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, Band, response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 from omsm_ros.report.common import style
@@ -22,12 +22,20 @@ _NM_PER_UM = MICROMETRE_M / NANOMETRE_M
 _SMALLEST_SHOWN_NM_PER_UM = 1e-4
 
 
+class HasResponse(Protocol):
+    """Whatever can be asked for its response: a transfer function, the truth of the twin."""
+
+    def response(self, frequency: FloatArray) -> ComplexArray:
+        """G at ``frequency`` (n,) [Hz]."""
+        ...
+
+
 def frequencies(identified: Calibration) -> FloatArray:
     """Frequencies of a Bode plot [Hz]: up to Nyquist's, for the data say nothing beyond."""
     return np.geomspace(_LOWEST_HZ, 0.5 / identified.sample_period, 600)
 
 
-def bode(identified: Calibration, true: TransferFunction | None, sample_period: float) -> Figure:
+def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
     """Gain, phase, and the error of a motion before and after the correction.
 
     true: the twin's G_m, drawn where known
@@ -50,7 +58,7 @@ def draw_gain(
     axes: Axes,
     frequency: FloatArray,
     identified: Calibration,
-    true: TransferFunction | None,
+    true: HasResponse | None,
     title: str = "",
 ) -> None:
     """|G_m| with its 95 % band."""
@@ -75,7 +83,7 @@ def draw_gain(
 
 
 def draw_phase(
-    axes: Axes, frequency: FloatArray, identified: Calibration, true: TransferFunction | None
+    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
 ) -> None:
     """Phase of G_m [deg] with its 95 % band."""
     angle = _phase(identified.dynamics, frequency)
@@ -93,12 +101,12 @@ def _band(identified: Calibration, frequency: FloatArray) -> Band:
     return response_band(identified.dynamics, identified.covariance, frequency)
 
 
-def _phase(system: TransferFunction, frequency: FloatArray) -> FloatArray:
+def _phase(system: HasResponse, frequency: FloatArray) -> FloatArray:
     return np.asarray(np.unwrap(np.angle(system.response(frequency))) / DEGREE_RAD)
 
 
 def _draw_error(
-    axes: Axes, frequency: FloatArray, identified: Calibration, true: TransferFunction | None
+    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
 ) -> None:
     fitted = identified.dynamics.response(frequency)
     reference = fitted if true is None else true.response(frequency)

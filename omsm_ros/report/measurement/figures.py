@@ -15,12 +15,11 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.common import style
-from omsm_ros.report.common.response_figures import draw_gain, draw_phase, frequencies
+from omsm_ros.report.common.response_figures import HasResponse, draw_gain, draw_phase, frequencies
 from omsm_ros.report.measurement.raster import Raster, rasterise
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
@@ -221,7 +220,7 @@ def overview_figure(
     raw: FloatArray,
     corrected: FloatArray,
     identified: Calibration,
-    true: TransferFunction | None = None,
+    true: HasResponse | None = None,
 ) -> Figure:
     """One wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
 

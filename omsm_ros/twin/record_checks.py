@@ -1,0 +1,63 @@
+"""What every record of a disturbance is checked for, and when it is switched on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.errors import ConfigurationError
+
+# By the unit that ends a field's name: what no machine exceeds. Beyond it a unit is wrong, and the
+# simulation would take for ever or leave the range of its numbers.
+_LIMITS: Mapping[str, float] = {
+    "_m": 10.0,
+    "_s": 1e6,
+    "_hz": 1e6,
+    "_rad": 10.0,
+    "_ppm": 1e5,
+    "_ratio": 100.0,
+}
+LONGEST_LAG_S = 1.0
+"""Nothing that delays a sample is longer: the simulation starts so much earlier."""
+
+
+def check_numbers(
+    record: Any,
+    *,
+    positive: tuple[str, ...] = (),
+    not_negative: tuple[str, ...] = (),
+    lags: tuple[str, ...] = (),
+) -> None:
+    """Raise ConfigurationError for a number of a record that is not finite or out of its limits.
+
+    positive, not_negative: names of fields that must be so
+    lags: names of times that are at most a second, of either sign
+    """
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            continue
+        limit = LONGEST_LAG_S if field.name in lags else _limit(field.name)
+        least = -limit
+        if field.name in positive or field.name in not_negative:
+            least = 0.0
+        zero_refused = field.name in positive and value == 0
+        if not least <= value <= limit or zero_refused:
+            expected = "a positive number" if field.name in positive else "a number"
+            raise ConfigurationError(
+                f"{type(record).__name__}: {field.name} is {value!r}, expected {expected} from "
+                f"{least:g} to {limit:g}; check its unit"
+            )
+
+
+def _limit(name: str) -> float:
+    ends = (limit for unit, limit in _LIMITS.items() if name.endswith(unit))
+    return next(ends, float(np.finfo(np.float64).max))
+
+
+def is_default(record: Any) -> bool:
+    """True if a record is as it is without arguments: nothing is switched on."""
+    return bool(record == type(record)())

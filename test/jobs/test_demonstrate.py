@@ -1,0 +1,59 @@
+"""The demonstration as it is planned, and what it says of the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omsm_ros.errors import FileError, OmsmError
+from omsm_ros.jobs.demonstrate import Demonstration, response_errors, true_response
+from omsm_ros.storage.disturbance_file import save_disturbances
+from omsm_ros.twin.catalogue import CATALOGUE
+from omsm_ros.twin.cell import Recording
+from omsm_ros.twin.disturbances import NOTHING
+from omsm_ros.twin.scenario import step_test_of
+
+
+def test_without_a_file_nothing_is_wrong_with_the_machine(tmp_path):
+    plan = Demonstration(tmp_path)
+    assert plan.disturbances == NOTHING
+    assert plan.emulator_parameters()["disturbances"] == ""
+
+
+def test_the_emulator_is_given_the_file_by_its_whole_path(tmp_path, monkeypatch):
+    latency = CATALOGUE["latency"][2]
+    save_disturbances(tmp_path / "d.yaml", latency)
+    monkeypatch.chdir(tmp_path)
+    plan = Demonstration(tmp_path / "out", disturbance_file=(tmp_path / "d.yaml").relative_to("/"))
+    assert Demonstration(tmp_path, disturbance_file=tmp_path / "d.yaml").disturbances == latency
+    assert str(plan.emulator_parameters()["disturbances"]).startswith("/")
+
+
+def test_a_file_that_cannot_be_read_is_told_before_anything_is_cleared(tmp_path):
+    kept = tmp_path / "calibration.json"
+    kept.write_text("{}")
+    with pytest.raises(FileError, match="nowhere"):
+        Demonstration(tmp_path, disturbance_file=tmp_path / "nowhere.yaml").prepare()
+    assert kept.exists()
+
+
+def test_the_truth_holds_the_latency(true_calibration):
+    """Against a probe 0.34 ms late, the plant's own dynamics lead by ω · 0.34 ms."""
+    step = step_test_of(Demonstration(Path()).scenario, CATALOGUE["latency"][2])
+    for row in response_errors(true_calibration, true_response(step)):
+        assert row["gain_error"] == pytest.approx(0.0, abs=1e-9)
+        expected = 360 * row["frequency"] * 0.34e-3
+        assert row["phase_error_deg"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_recording_without_truth_has_no_true_response(step_test):
+    foreign = Recording(
+        axes=step_test.axes,
+        distance=step_test.distance,
+        probe_motion=np.zeros(1),
+        surface_height=np.zeros(1),
+    )
+    with pytest.raises(OmsmError, match="without the truth"):
+        true_response(foreign)
