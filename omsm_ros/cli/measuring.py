@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
@@ -13,13 +15,14 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.correction.uncertainty import sources_with
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.machine.limits import MachineLimits, ScanPath
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
 from omsm_ros.jobs.measure import measure
-from omsm_ros.jobs.read_bag import motion_in
+from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
-from omsm_ros.storage.machine_files import load_geometry, load_surface
+from omsm_ros.storage.machine_files import load_geometry, load_limits, load_surface
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
@@ -149,16 +152,24 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
         default=DEFAULT_BUDGET_M,
         help="allowed residual, k = 2 [m]",
     )
+    sub.add_argument(
+        "--limits",
+        type=Path,
+        metavar="LIMITS.yaml",
+        help="of servo, probe, spindle and axes, as config/limits.yaml; default: the paper's",
+    )
 
 
 def _predict(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     if args.motion.suffix == ".csv":
         z, period = load_motion(args.motion)
+        path = ScanPath(z=z, sample_period=period)
     else:
         with progress_bar("reading", args.json) as progress:
-            z, period = motion_in(args.motion, progress)
-    return asdict(predict_error(calibration, z, period, args.budget))
+            path = path_in(args.motion, progress)
+    limits = load_limits(args.limits) if args.limits else MachineLimits()
+    return asdict(predict_error(calibration, path, args.budget, limits))
 
 
 def _show_predict(facts: Facts) -> None:
@@ -169,10 +180,17 @@ def _show_predict(facts: Facts) -> None:
                               f"{facts['rms'] / MICROMETRE_M:.3f} µm rms"),
             ("left after correction", f"{facts['residual'] / NANOMETRE_M:.2f} nm (k = 1)"),
             ("motion outside the band", f"{100 * facts['outside_band_fraction']:.2g} %"),
-            ("may run faster by", f"{facts['speed_factor']:.3g}"),
+            ("may run faster by", f"{facts['speed_factor']:.3g}, bound by {facts['binding']}"),
+            *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
+            ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
             ("because", facts["message"]),
         ]
     )  # fmt: skip
+
+
+def _limit_text(limit: Mapping[str, Any]) -> str:
+    value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
+    return f"{value:.3g} of {allowed:.3g} {unit}, {limit['speed_factor']:.3g} times as fast"
 
 
 COMMANDS = (

@@ -8,11 +8,10 @@ import numpy as np
 
 from omsm_ros.core.correction.predict import Prediction, predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import (
-    FloatArray,
-)
+from omsm_ros.core.machine.limits import ScanPath
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
-from omsm_ros.jobs.read_bag import motion_in
+from omsm_ros.jobs.read_bag import path_in
 
 
 def predict_from(
@@ -22,5 +21,7 @@ def predict_from(
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
-        z, sample_period = motion_in(Path(bag))
-    return predict_error(calibration, np.asarray(z, np.float64), sample_period)
+        return predict_error(calibration, path_in(Path(bag)))
+    return predict_error(
+        calibration, ScanPath(z=np.asarray(z, np.float64), sample_period=sample_period)
+    )

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import (
-    Block,
-    FloatArray,
-)
+from omsm_ros.core.machine.limits import ScanPath
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bags
 
@@ -55,3 +53,26 @@ def motion_in(
     if not found:
         raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
     return np.concatenate(found)[:most], period
+
+
+def path_in(path: Path, progress: Progress = no_progress) -> ScanPath:
+    """Return the path that a bag holds, with its readings where it has some."""
+    with bags.BagReader(path) as bag:
+        probed = any(t.topic == bags.DISTANCE_TOPIC and t.messages for t in bag.topics())
+    topics = [bags.AXES_TOPIC, *([bags.DISTANCE_TOPIC] if probed else [])]
+    blocks = read_blocks(path, topics, progress)
+    axes = [b for b in blocks[bags.AXES_TOPIC] if isinstance(b, AxisBlock)]
+    if not axes:
+        raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
+    readings = [
+        np.where(b.ok, b.distance, np.nan)
+        for b in blocks.get(bags.DISTANCE_TOPIC, [])
+        if isinstance(b, DistanceBlock)
+    ]
+    return ScanPath(
+        z=np.concatenate([b.z for b in axes]),
+        sample_period=axes[0].sample_period,
+        x=np.concatenate([b.x for b in axes]),
+        c=np.concatenate([b.c for b in axes]),
+        distance=np.concatenate(readings) if readings else None,
+    )

@@ -1,4 +1,4 @@
-"""``SURFACE.yaml`` and ``GEOMETRY.yaml``: what is measured, and where the probe sits."""
+"""``SURFACE.yaml``, ``GEOMETRY.yaml``, ``LIMITS.yaml``: the part, the probe, the machine."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import yaml
 
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.nominal import SHAPES
 from omsm_ros.errors import ConfigurationError, FileError, SurfaceError
@@ -36,6 +37,12 @@ def load_geometry(path: Path | str) -> Geometry:
     """Read ``GEOMETRY.yaml``: where the probe sits and looks, in metres and slopes."""
     values = _read_mapping(path, "geometry", FileError)
     return _made(Geometry, values, FileError, f"geometry {str(path)!r}")
+
+
+def load_limits(path: Path | str) -> MachineLimits:
+    """Read ``LIMITS.yaml``: what servo, probe, spindle and axes can do, units in the names."""
+    values = _read_mapping(path, "limits", FileError)
+    return _made(MachineLimits, values, FileError, f"limits {str(path)!r}")
 
 
 def save_geometry(path: Path | str, geometry: Geometry) -> None:

@@ -1,34 +1,51 @@
-"""Is this motion safe to measure with?
+"""Is this motion safe to measure with, and how fast may it be run?
 
-From a planned or recorded Z motion: the dynamic error it would cause, what the correction
-leaves of it, and how much faster the same path may be run. What lies beyond the frequency
-to which the calibration is trusted counts as not corrected at all.
+From a planned or recorded motion: the dynamic error that it would cause, what the correction
+leaves of it, and how much faster the same path may be run. The error is that of the path in
+time, and its bound is that of the worst place, not the mean of the scan. What lies beyond the
+frequency to which the calibration is trusted counts as not corrected at all. The speed is the
+least of all limits, and the one that binds is named.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.uncertainty import sensitivity_numerators
+from omsm_ros.core.correction.uncertainty import sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.dynamics.discretisation_error import checked_motion, velocity_spectrum
+from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
+from omsm_ros.core.dynamics.discretisation_error import (
+    checked_motion,
+    fast_length,
+    velocity_spectrum,
+)
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.limits import (
+    FASTEST,
+    MachineLimits,
+    ScanPath,
+    SpeedLimit,
+    highest_factor,
+    speed_limits,
+)
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import NANOMETRE_M
 
 DEFAULT_BUDGET_M = 50 * NANOMETRE_M
-FASTEST = 100.0
 _START_SAMPLES = 12
-_SINGLE_LINES = 2000
-# Ten to the fourth between the ends: known to a hundredth of a per cent.
-_BISECTIONS = 16
+# The speed is sought on the worst stretches of the path and proved on the whole of it.
+_STRETCH_SAMPLES = 8192
+# The band that counts as trusted ends between these shares of the frequency of trust.
+_PASSED_SHARE = 0.8
+# A millimetre of travel through the stop band is then ten nanometres, of which 1 - G passes.
+_ATTENUATION_DB = 100.0
+# An error beyond the band is taken as its rms over so many seconds.
+_RUNNING_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -36,11 +53,13 @@ class Prediction:
     """What a motion does to the measurement.
 
     peak_to_valley, rms: of the dynamic error (1 - G) z without correction [m]
-    residual: standard uncertainty that the correction leaves [m]
+    residual: largest standard uncertainty that the correction leaves on the path [m], k = 1
     outside_band_fraction: share of the mean square velocity above the trusted band [1]
-    speed_factor: how much faster the path may be run with 2 residual <= budget, at most 100;
+    speed_factor: how much faster the path may be run within all limits, at most 100;
         0 if it may not be run at any speed
-    safe: 2 residual <= budget;  message: the same for a reader
+    safe: no limit is exceeded;  binding: name of the limit that is reached first
+    limits: all that were evaluated, that of the dynamics first;  not_evaluated: the others
+    message: the same for a reader
     """
 
     peak_to_valley: float
@@ -49,42 +68,48 @@ class Prediction:
     outside_band_fraction: float
     speed_factor: float
     safe: bool
+    binding: str
+    limits: tuple[SpeedLimit, ...]
+    not_evaluated: tuple[str, ...]
     message: str
 
 
 def predict_error(
     calibration: Calibration,
-    z: FloatArray,
-    sample_period: float,
+    path: ScanPath,
     budget: float = DEFAULT_BUDGET_M,
+    limits: MachineLimits | None = None,
 ) -> Prediction:
-    """Judge the motion ``z`` (n,) [m] sampled every ``sample_period`` [s] against ``budget`` [m].
+    """Judge a motion against the allowed error ``budget`` [m], k = 2, and the machine's limits.
 
     Raises DataError for a motion that is too short or not finite, ConfigurationError for a
     budget that is not positive.
     """
     if not 0 < budget < np.inf:
         raise ConfigurationError(f"budget {budget!r} m, expected a positive length")
-    motion = checked_motion(z)
-    error = dynamic_error(calibration.dynamics, motion, sample_period)
-    spectrum = _Spectrum(calibration, motion, sample_period)
-    residual = spectrum.residual(1.0)
-    factor = spectrum.highest_speed(budget / 2)
-    safe = 2 * residual <= budget
-    peak_to_valley = float(np.ptp(error))
+    path = replace(path, z=checked_motion(path.z))
+    error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
+    spread = float(np.ptp(error))
+    dynamics, residual = _dynamics_limit(calibration, path, budget)
+    others, missing = speed_limits(path, limits or MachineLimits(), calibration.valid_up_to, budget)
+    every = (dynamics, *others)
+    binding = min(every, key=lambda limit: limit.speed_factor)
     return Prediction(
-        peak_to_valley=peak_to_valley,
+        peak_to_valley=spread,
         rms=float(np.std(error)),
         residual=residual,
-        outside_band_fraction=spectrum.outside_fraction,
-        speed_factor=factor,
-        safe=safe,
-        message=_message(calibration, peak_to_valley, residual, budget, factor),
+        outside_band_fraction=_outside_fraction(calibration, path),
+        speed_factor=binding.speed_factor,
+        safe=binding.speed_factor >= 1,
+        binding=binding.name,
+        limits=every,
+        not_evaluated=tuple(missing),
+        message=_message(calibration, spread, residual, budget, binding),
     )
 
 
 def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: float) -> FloatArray:
-    """(1 - G) z [m] (Eq. 5) after the filter has settled, shape (n - settling,)."""
+    """Return (1 - G) z [m] (Eq. 5) after the filter has settled, shape (n - settling,)."""
     digital = discretise(dynamics, sample_period)
     settling = max(digital.settling_samples(SETTLED), _START_SAMPLES)
     if len(z) <= 2 * settling:
@@ -92,79 +117,140 @@ def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: floa
             f"motion of {len(z)} samples, expected more than {2 * settling}: the filter needs "
             f"{settling} to settle"
         )
+    return (z - _through(digital, z))[settling:]
+
+
+def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: float) -> FloatArray:
+    """Return the standard uncertainty of G z that the correction leaves [m], at most (n,).
+
+    Within the trusted band it is that of the calibration's covariance, and above it the whole
+    (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
+    it at either, the motion above the band is taken to be as large as next to them.
+    """
+    variance = np.zeros(len(z))
+    for digital in sensitivity_filters(calibration, sample_period):
+        variance += _through(digital, z) ** 2
+    digital = discretise(calibration.dynamics, sample_period)
+    variance += _missed_beyond(calibration.valid_up_to, digital, z)
+    settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(variance) // 4)
+    return np.sqrt(variance[settling:])
+
+
+def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
+    """Return the mean square of (1 - G) z above ``up_to`` [Hz], running over the record, (n,)."""
+    kernel = _band_kernel(up_to, digital.sample_period, len(z))
+    half = len(kernel) // 2
+    if not half:
+        return np.zeros(len(z))
+    centred = z - z[0]
+    # Beyond the kernel's reach the record's ends would count as motion.
+    fast = (centred - _convolved(centred, kernel))[half:-half]
+    missed = _running_mean(
+        (fast - _through(digital, fast)) ** 2, round(_RUNNING_S / digital.sample_period)
+    )
+    return np.pad(missed, half, mode="edge")
+
+
+def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray:
+    """Return a low-pass of linear phase that falls from 0.8 ``up_to`` to ``up_to`` [Hz].
+
+    By Kaiser's window, 100 dB or what fits into half of ``samples``; one tap where all passes.
+    """
+    if up_to >= 0.5 / sample_period:
+        return np.ones(1)
+    transition = (1 - _PASSED_SHARE) * up_to * sample_period
+    # Kaiser (1974): taps and shape for an attenuation over a transition.
+    half = int(np.ceil((_ATTENUATION_DB - 8) / (2.285 * 2 * np.pi * transition) / 2))
+    half = min(half, samples // 4)
+    index = np.arange(-half, half + 1)
+    cutoff = (1 + _PASSED_SHARE) / 2 * up_to * sample_period
+    kernel = 2 * cutoff * np.sinc(2 * cutoff * index)
+    kernel = kernel * np.kaiser(len(index), 0.1102 * (_ATTENUATION_DB - 8.7))
+    return np.asarray(kernel / kernel.sum())
+
+
+def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
+    """Return the convolution (n,), by FFT; true where the kernel lies inside the record."""
+    length = fast_length(len(values) + len(kernel) - 1)
+    product = np.fft.rfft(values, length) * np.fft.rfft(kernel, length)
+    half = len(kernel) // 2
+    return np.asarray(np.fft.irfft(product, length)[half : half + len(values)])
+
+
+def _through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
     recursion = Recursion(digital)
     recursion.start(past_motion(z[:_START_SAMPLES]))
-    return (z - recursion.run(z))[settling:]
+    return recursion.run(z)
 
 
-class _Spectrum:
-    """The motion's velocity over frequency, and what the calibration makes of it."""
-
-    def __init__(self, calibration: Calibration, z: FloatArray, sample_period: float) -> None:
-        self._calibration = calibration
-        self._numerators = sensitivity_numerators(calibration)
-        frequency, velocity = velocity_spectrum(z, sample_period)
-        power = abs(velocity) ** 2 / 2
-        outside = frequency > calibration.valid_up_to
-        total = float(power.sum())
-        self.outside_fraction = float(power[outside].sum()) / total if total > 0 else 0.0
-        self._frequency, self._power = _gathered(frequency, power)
-
-    def residual(self, speed: float) -> float:
-        """Standard uncertainty after correction [m] if the path is run ``speed`` times faster."""
-        frequency = np.maximum(self._frequency, self._frequency[1] / 2) * speed
-        s = 2j * np.pi * frequency
-        trusted = frequency <= self._calibration.valid_up_to
-        g = self._calibration.dynamics
-        weight = np.empty(len(s))
-        denominator = polynomial.polyval(s[trusted], g.denominator) ** 2
-        sensitivities = polynomial.polyval(s[trusted], self._numerators.T) / denominator
-        weight[trusted] = np.sum(abs(sensitivities) ** 2, axis=0)
-        weight[~trusted] = abs(1 - g.at(s[~trusted])) ** 2
-        # The power is that of dz/dt at speed 1; faster, it is the same path in less time.
-        return float(np.sqrt(np.sum(weight * self._power / abs(s / speed) ** 2)))
-
-    def highest_speed(self, allowed: float) -> float:
-        if self.residual(FASTEST) <= allowed:
-            return FASTEST
-        low, high = 1 / FASTEST, FASTEST
-        if self.residual(low) > allowed:
-            return 0.0
-        for _ in range(_BISECTIONS):
-            middle = float(np.sqrt(low * high))
-            low, high = (middle, high) if self.residual(middle) <= allowed else (low, middle)
-        return low
+def _running_mean(values: FloatArray, width: int) -> FloatArray:
+    """Return the mean of the nearest ``width`` values, (n,)."""
+    width = int(np.clip(width, 1, len(values)))
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
+    return np.asarray(np.maximum(total[first + width] - total[first], 0.0) / width)
 
 
-def _gathered(frequency: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The spectrum with lines nearer than half a per cent taken together, at their mean.
+def _dynamics_limit(
+    calibration: Calibration, path: ScanPath, budget: float
+) -> tuple[SpeedLimit, float]:
+    """Return the limit that the correction's residual sets, and that residual as it is [m]."""
+    z, period, allowed = path.z, path.sample_period, budget / 2
+    here = residual_over_time(calibration, z, period)
+    residual = float(np.max(here))
+    stretches = _worst_stretches(z, here)
 
-    The sensitivities are smooth over so little; the search for a speed looks at every line
-    many times.
-    """
-    ends = np.geomspace(_SINGLE_LINES, len(frequency), int(200 * np.log(len(frequency)))).astype(
-        int
-    )
-    starts = np.unique(np.r_[np.arange(_SINGLE_LINES), ends])
-    starts = starts[starts < len(frequency)]
-    together = np.add.reduceat(power, starts)
-    counts = np.diff(np.r_[starts, len(frequency)])
-    mean = np.add.reduceat(frequency, starts) / counts
-    return mean, together
+    def worst(factor: float) -> float:
+        faster = period / factor
+        return max(float(np.max(residual_over_time(calibration, s, faster))) for s in stretches)
+
+    factor = highest_factor(worst, allowed)
+    if 0 < factor < FASTEST or (factor == FASTEST and residual > 0):
+        # A path of which a stretch is within the budget need not be so as a whole.
+        whole = float(np.max(residual_over_time(calibration, z, period / factor)))
+        factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
+    return SpeedLimit("dynamics", residual, allowed, "m", float(factor)), residual
+
+
+def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
+    """Return the parts of ``z`` around its largest residual, its fastest and its most curved."""
+    if len(z) <= 2 * _STRETCH_SAMPLES:
+        return [z]
+    starts = set()
+    for signal in (residual, np.abs(np.diff(z)), np.abs(np.diff(z, 2))):
+        level = _running_mean(signal, _STRETCH_SAMPLES // 8)
+        middle = int(np.argmax(level)) + len(z) - len(signal)
+        starts.add(int(np.clip(middle - _STRETCH_SAMPLES // 2, 0, len(z) - _STRETCH_SAMPLES)))
+    return [z[start : start + _STRETCH_SAMPLES] for start in sorted(starts)]
+
+
+def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
+    frequency, velocity = velocity_spectrum(path.z, path.sample_period)
+    power = np.abs(velocity) ** 2
+    total = float(power.sum())
+    return float(power[frequency > calibration.valid_up_to].sum()) / total if total > 0 else 0.0
 
 
 def _message(
-    calibration: Calibration, peak_to_valley: float, residual: float, budget: float, factor: float
+    calibration: Calibration,
+    peak_to_valley: float,
+    residual: float,
+    budget: float,
+    binding: SpeedLimit,
 ) -> str:
     verdict = "within" if 2 * residual <= budget else "beyond"
+    factor = binding.speed_factor
     if factor == 0:
-        advice = "no speed of this path is within it; calibrate better"
+        advice = f"no speed of this path is within the limit of {binding.name}"
     elif factor >= FASTEST:
-        advice = "any practical speed is within it"
+        advice = f"it may be run {FASTEST:g} times as fast, further was not tried"
+    elif factor >= 1:
+        advice = f"it may be run up to {factor:.3g} times as fast; then {binding.name} binds"
     else:
-        advice = f"the path may be run up to {factor:.3g} times as fast"
+        advice = f"run it at {factor:.3g} times this speed or slower: {binding.name} binds"
     return (
         f"dynamic error {peak_to_valley / NANOMETRE_M:.0f} nm peak to valley; corrected within "
-        f"{2 * residual / NANOMETRE_M:.1f} nm (k = 2), {verdict} the budget of "
-        f"{budget / NANOMETRE_M:.1f} nm; {advice} (trusted up to {calibration.valid_up_to:.3g} Hz)"
+        f"{2 * residual / NANOMETRE_M:.1f} nm (k = 2, largest on the path), {verdict} the budget "
+        f"of {budget / NANOMETRE_M:.1f} nm; {advice} (trusted up to "
+        f"{calibration.valid_up_to:.3g} Hz)"
     )

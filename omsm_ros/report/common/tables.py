@@ -98,6 +98,8 @@ def motion_table(summary: Mapping[str, object]) -> Table:
             NOTHING if outside is None else f"{100 * outside:.2g} %",
         ),
         ("could have run faster by", NOTHING if factor is None else f"{factor:.3g} ×"),
+        ("the limit that binds then", str(prediction.get("binding") or NOTHING)),
+        ("limits not evaluated", ", ".join(prediction.get("not_evaluated") or ()) or NOTHING),
         (
             "discretisation, peak to valley",
             quantity(part(summary, "discretisation", "peak_to_valley"), "m"),

@@ -1,0 +1,229 @@
+"""How fast can the machine and the probe run a path, apart from its dynamic error?
+
+Each limit compares one quantity of the path with what is allowed, and tells how many times
+as fast the same path may be run until the two are equal. Run k times as fast, velocities grow
+by k, accelerations by k² and jerks by k³. What is not declared is named, not assumed harmless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import Quantity
+from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
+
+FASTEST = 100.0
+"""No path is said to run more than so many times as fast; nor less than the inverse."""
+
+# Ten to the fourth between the ends: known to a hundredth of a per cent.
+_BISECTIONS = 16
+# What the samples hold above it is the encoder's noise rather than the path.
+_CONTENT_SHARE = 0.999
+# Derivatives are those of quintics over a quarter period of the fastest content, but of at least
+# so many samples, so that the encoder's noise stays below the path.
+_LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
+_START_SAMPLES = 12
+
+_DECLARED = Quantity("limit", "", 1e-12, 1e12, "give it in the unit of its name")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineLimits:
+    """What machine and probe can do; None where nobody has declared it.
+
+    servo_frequency: natural frequency of the Z servo, taken as critically damped [Hz]; typical
+        of a slow tool servo, and that of the paper, are 50 Hz
+    probe_range: over which the probe reads [m];  spindle_speed_rpm: [1/min], the paper's model
+        holds below 120;  motion_frequency: highest content of the Z motion [Hz], the paper's 50
+    z_acceleration: [m/s²];  z_jerk: [m/s³];  point_spacing: along the path [m]
+    exposure: of one reading [s];  timing: standard uncertainty of a trigger [s]
+    """
+
+    servo_frequency: float | None = 50.0
+    probe_range: float | None = 100 * MICROMETRE_M
+    spindle_speed_rpm: float | None = 120.0
+    motion_frequency: float | None = 50.0
+    z_acceleration: float | None = None
+    z_jerk: float | None = None
+    point_spacing: float | None = None
+    exposure: float | None = None
+    timing: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if (value := getattr(self, name)) is not None:
+                _DECLARED.checked(value, ConfigurationError, name)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanPath:
+    """A path over time: z [m] (n,), and what else is known of it, each (n,) or None.
+
+    x: [m];  c: [rad];  distance: of a recorded scan [m], NaN where the probe lost the surface
+    """
+
+    z: FloatArray
+    sample_period: float
+    x: FloatArray | None = None
+    c: FloatArray | None = None
+    distance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedLimit:
+    """One limit of a path.
+
+    value: as the path is;  allowed: at most, in the same ``unit``
+    speed_factor: how many times as fast the path may be run, 0 if at no speed
+    """
+
+    name: str
+    value: float
+    allowed: float
+    unit: str
+    speed_factor: float
+
+
+def highest_factor(value_at: Callable[[float], float], allowed: float) -> float:
+    """Return the largest speed factor at which ``value_at(factor)``, which rises, is allowed.
+
+    Between 1 / FASTEST and FASTEST; 0 if it is not allowed at any.
+    """
+    if value_at(FASTEST) <= allowed:
+        return FASTEST
+    low, high = 1 / FASTEST, FASTEST
+    if value_at(low) > allowed:
+        return 0.0
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if value_at(middle) <= allowed else (low, middle)
+    return low
+
+
+def speed_limits(
+    path: ScanPath, limits: MachineLimits, valid_up_to: float, budget: float
+) -> tuple[list[SpeedLimit], list[str]]:
+    """Return the limits that can be evaluated, and the names of those that cannot.
+
+    valid_up_to: frequency to which the calibration is trusted [Hz]
+    budget: allowed error of a height, k = 2 [m], for what exposure and timing cost
+    """
+    evaluated, missing = [], []
+    for limit in _all_limits(path, limits, valid_up_to, budget):
+        if isinstance(limit, str):
+            missing.append(limit)
+        else:
+            evaluated.append(limit)
+    return evaluated, missing
+
+
+def _all_limits(
+    path: ScanPath, limits: MachineLimits, valid_up_to: float, budget: float
+) -> Iterator[SpeedLimit | str]:
+    content = content_frequency(path.z, path.sample_period)
+    velocity, acceleration, jerk = steepest(path.z, path.sample_period, content)
+    yield _power("calibrated band", content, valid_up_to, "Hz", 1)
+    yield _power("motion frequency", content, limits.motion_frequency, "Hz", 1)
+    yield _following(path, limits)
+    yield _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2)
+    yield _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3)
+    yield _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1)
+    yield _power("spacing at the rim", _spacing(path), limits.point_spacing, "m", 1)
+    exposed = None if limits.exposure is None else limits.exposure**2 / 24 * acceleration
+    yield _power("path within one exposure", exposed, budget / 2, "m", 2)
+    late = None if limits.timing is None else limits.timing * velocity
+    yield _power("timing of the trigger", late, budget / 2, "m", 1)
+
+
+def _power(
+    name: str, value: float | None, allowed: float | None, unit: str, power: int
+) -> SpeedLimit | str:
+    """Return the limit of a quantity that grows with a power of the speed, or its name."""
+    if value is None or allowed is None:
+        return name
+    factor = FASTEST if value == 0 else min((allowed / value) ** (1 / power), FASTEST)
+    return SpeedLimit(name, value, allowed, unit, float(factor))
+
+
+def content_frequency(z: FloatArray, sample_period: float) -> float:
+    """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies; 0 at rest."""
+    velocity = np.diff(z)
+    power = np.abs(np.fft.rfft(velocity - np.mean(velocity))) ** 2
+    total = float(np.sum(power))
+    if total <= (1e-15 * float(np.max(np.abs(z), initial=0.0))) ** 2 * len(z) ** 2:
+        return 0.0
+    place = int(np.searchsorted(np.cumsum(power), _CONTENT_SHARE * total))
+    return float(place / (len(velocity) * sample_period))
+
+
+def steepest(z: FloatArray, sample_period: float, content: float) -> tuple[float, float, float]:
+    """Return the largest |velocity| [m/s], |acceleration| [m/s²] and |jerk| [m/s³] of ``z`` (n,).
+
+    By local quintics (Savitzky and Golay) as wide as ``content`` [Hz] allows.
+    """
+    width = 1 / (8 * content * sample_period) if content else _MOST_HALF_WIDTH
+    half = int(np.clip(width, _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH))
+    half = min(half, (len(z) - 1) // 2)
+    index = np.arange(-half, half + 1)
+    kernels = np.linalg.pinv(np.vander(index / half, 6, increasing=True))
+    found = []
+    for power, factorial in ((1, 1), (2, 2), (3, 6)):
+        derivative = np.convolve(z - z[0], kernels[power][::-1], "valid")
+        scale = factorial / (half * sample_period) ** power
+        found.append(float(np.max(np.abs(derivative))) * scale)
+    return found[0], found[1], found[2]
+
+
+def following_error(
+    z: FloatArray, sample_period: float, servo_frequency: float, factor: float = 1.0
+) -> float:
+    """Return the largest distance [m] by which the servo leaves the path run at ``factor``.
+
+    The servo is 1 / (1 + s/ω)²; run faster, the path is the same over less time.
+    """
+    omega = 2 * np.pi * servo_frequency
+    servo = TransferFunction(np.ones(1), np.array([1.0, 2 / omega, 1 / omega**2]))
+    recursion = Recursion(discretise(servo, sample_period / factor))
+    recursion.start(past_motion(z[:_START_SAMPLES]))
+    # The past before the first sample is guessed; its response is over after ten time constants.
+    settling = min(int(10 / omega / (sample_period / factor)), len(z) // 2)
+    return float(np.max(np.abs(z - recursion.run(z))[settling:]))
+
+
+def _following(path: ScanPath, limits: MachineLimits) -> SpeedLimit | str:
+    name = "probe range against following error"
+    if limits.probe_range is None or limits.servo_frequency is None:
+        return name
+    servo = limits.servo_frequency
+
+    def excursion(factor: float) -> float:
+        return following_error(path.z, path.sample_period, servo, factor)
+
+    now, taken = excursion(1.0), 0.0
+    if path.distance is not None and np.any(np.isfinite(path.distance)):
+        # What the readings span already, beyond the servo's own error: shape, tilt, set-up.
+        taken = max(float(np.nanmax(np.abs(path.distance))) - now, 0.0)
+    factor = highest_factor(lambda k: excursion(k) + taken, limits.probe_range / 2)
+    return SpeedLimit(name, now + taken, limits.probe_range / 2, "m", factor)
+
+
+def _spindle_rpm(path: ScanPath) -> float | None:
+    if path.c is None:
+        return None
+    return float(abs(path.c[-1] - path.c[0]) / ((len(path.c) - 1) * path.sample_period) / RPM_RAD_S)
+
+
+def _spacing(path: ScanPath) -> float | None:
+    """Return the largest distance between neighbouring points [m], over the chuck's plane."""
+    if path.x is None or path.c is None:
+        return None
+    radius = 0.5 * np.abs(path.x[1:] + path.x[:-1])
+    return float(np.max(np.hypot(np.diff(path.x), radius * np.diff(path.c))))

@@ -1,0 +1,139 @@
+"""The machine's limits, against closed forms for sines and the paper's path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.machine.limits import (
+    FASTEST,
+    MachineLimits,
+    ScanPath,
+    content_frequency,
+    following_error,
+    highest_factor,
+    speed_limits,
+    steepest,
+)
+from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import ConfigurationError
+
+PERIOD = 1e-3
+TIME = np.arange(20_000) * PERIOD
+AMPLITUDE, FREQUENCY = 0.4e-3, 2.0
+SINE = AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * TIME)
+OMEGA = 2 * np.pi * FREQUENCY
+
+
+def limit(name: str, path: ScanPath, limits: MachineLimits, budget: float = 50e-9):
+    evaluated, missing = speed_limits(path, limits, 60.0, budget)
+    assert name not in missing
+    return next(found for found in evaluated if found.name == name)
+
+
+def test_derivatives_of_a_sine_are_its_own() -> None:
+    velocity, acceleration, jerk = steepest(SINE, PERIOD, content_frequency(SINE, PERIOD))
+    assert velocity == pytest.approx(AMPLITUDE * OMEGA, rel=0.02)
+    assert acceleration == pytest.approx(AMPLITUDE * OMEGA**2, rel=0.02)
+    assert jerk == pytest.approx(AMPLITUDE * OMEGA**3, rel=0.1)
+
+
+def test_encoder_noise_is_not_taken_for_acceleration() -> None:
+    noisy = SINE + np.random.default_rng(1).normal(0, 1e-9, len(SINE))
+    _, acceleration, _ = steepest(noisy, PERIOD, content_frequency(noisy, PERIOD))
+    assert acceleration == pytest.approx(AMPLITUDE * OMEGA**2, rel=0.05)
+
+
+def test_content_of_a_sine_is_its_frequency_and_of_a_rest_none() -> None:
+    assert content_frequency(SINE, PERIOD) == pytest.approx(FREQUENCY, abs=0.1)
+    assert content_frequency(np.full(1000, 0.02), PERIOD) == 0.0
+
+
+@pytest.mark.parametrize("servo", [50.0, 200.0])
+@pytest.mark.parametrize("factor", [1.0, 7.0])
+def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: float) -> None:
+    lost = abs(1 - 1 / (1 + 1j * FREQUENCY * factor / servo) ** 2)
+    found = following_error(SINE, PERIOD, servo, factor)
+    assert found == pytest.approx(AMPLITUDE * lost, rel=2e-3)
+
+
+def test_the_papers_scan_at_1221_rpm_leaves_the_probes_range() -> None:
+    """A servo of 200 Hz follows 0.11 mm late there, of 0.05 mm allowed."""
+    spiral = Spiral(PAPER_MIRROR, 12.7e-3, feed_per_turn=0.1e-3, spindle_speed=30.0)
+    positions = spiral.positions(np.arange(20_000) * PERIOD)
+    path = ScanPath(z=positions.z, sample_period=PERIOD, x=positions.x, c=positions.c)
+    assert following_error(path.z, PERIOD, 200.0, 1221 / 30) == pytest.approx(113e-6, rel=0.02)
+    found = limit("probe range against following error", path, MachineLimits(servo_frequency=200.0))
+    assert following_error(path.z, PERIOD, 200.0, found.speed_factor) == pytest.approx(
+        50e-6, rel=1e-3
+    )
+    spindle = limit("spindle speed", path, MachineLimits())
+    assert spindle.value == pytest.approx(30.0)
+    assert spindle.speed_factor == pytest.approx(4.0)
+
+
+def test_what_the_readings_span_already_is_not_there_for_following() -> None:
+    readings = np.full(len(SINE), 30e-6)
+    readings[5] = np.nan
+    path = ScanPath(z=SINE, sample_period=PERIOD, distance=readings)
+    free = ScanPath(z=SINE, sample_period=PERIOD)
+    name, limits = "probe range against following error", MachineLimits(servo_frequency=200.0)
+    assert limit(name, path, limits).speed_factor < limit(name, free, limits).speed_factor
+    assert limit(name, path, limits).value == pytest.approx(30e-6)
+
+
+def test_powers_of_the_speed() -> None:
+    path = ScanPath(z=SINE, sample_period=PERIOD)
+    declared = MachineLimits(
+        z_acceleration=4 * AMPLITUDE * OMEGA**2,
+        z_jerk=8 * AMPLITUDE * OMEGA**3,
+        exposure=1e-3,
+        timing=1e-6,
+    )
+    assert limit("Z acceleration", path, declared).speed_factor == pytest.approx(2.0, rel=0.02)
+    assert limit("Z jerk", path, declared).speed_factor == pytest.approx(2.0, rel=0.05)
+    late = limit("timing of the trigger", path, declared)
+    assert late.value == pytest.approx(1e-6 * AMPLITUDE * OMEGA, rel=0.02)
+    assert late.speed_factor == pytest.approx(25e-9 / late.value)
+
+
+def test_path_within_one_exposure_is_the_loss_of_a_boxcar() -> None:
+    """The mean of a sine over τ is less than the sine by ω²τ²/24."""
+    tau = 2e-3
+    path = ScanPath(z=SINE, sample_period=PERIOD)
+    found = limit("path within one exposure", path, MachineLimits(exposure=tau))
+    lost = AMPLITUDE * (1 - np.sinc(FREQUENCY * tau))
+    assert found.value == pytest.approx(lost, rel=0.02)
+
+
+def test_spacing_at_the_rim() -> None:
+    x, c = np.full(1000, 12.7e-3), 2 * np.pi * 0.5 * np.arange(1000) * PERIOD
+    path = ScanPath(z=np.zeros(1000), sample_period=PERIOD, x=x, c=c)
+    found = limit("spacing at the rim", path, MachineLimits(point_spacing=80e-6))
+    assert found.value == pytest.approx(39.9e-6, rel=1e-3)
+    assert found.speed_factor == pytest.approx(80 / 39.9, rel=1e-2)
+
+
+def test_what_is_not_declared_or_not_known_is_named() -> None:
+    _, missing = speed_limits(ScanPath(z=SINE, sample_period=PERIOD), MachineLimits(), 60.0, 50e-9)
+    assert set(missing) == {
+        "Z acceleration",
+        "Z jerk",
+        "spindle speed",
+        "spacing at the rim",
+        "path within one exposure",
+        "timing of the trigger",
+    }
+
+
+def test_highest_factor_of_a_line() -> None:
+    assert highest_factor(lambda k: 2 * k, 6.0) == pytest.approx(3.0, rel=1e-3)
+    assert highest_factor(lambda k: 0.0, 1.0) == FASTEST
+    assert highest_factor(lambda k: 1.0, 0.5) == 0.0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_senseless_limit_is_named(value: float) -> None:
+    with pytest.raises(ConfigurationError, match="z_jerk"):
+        MachineLimits(z_jerk=value)
