@@ -16,18 +16,16 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.limits import PathStart, ScanPath
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
 from omsm_ros.storage.cloud_file import PlyWriter
 
 # No picture has so many pixels; the numbers of a summary come from all points.
 MOST_DRAWN = 1_000_000
-# A quarter of an hour at 1 kHz shows how a machine moves; of a spiral it is the fastest part.
-MOST_JUDGED = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,8 @@ class Correction:
     admission, reasons: how the calibration was admitted, and what spoke against it
     statistics: of the dynamic "error", and with a nominal surface of the "raw" and "corrected"
         deviation, over all points; empty without points
-    largest_uncertainty: [m];  points: evenly chosen, as in the cloud;  motion: z [m] (n,)
+    largest_uncertainty: [m];  points: evenly chosen, as in the cloud
+    path: its start, None without axes
     sample_period: [s]
     """
 
@@ -51,7 +50,7 @@ class Correction:
     statistics: dict[str, FormStatistics]
     largest_uncertainty: float
     points: NDArray[np.void]
-    motion: FloatArray
+    path: ScanPath | None
     sample_period: float
 
 
@@ -90,29 +89,12 @@ def correct_bag(
         with PlyWriter(cloud, comment) as ply:
             found = _Findings(nominal)
             for block, points in scan.steps():
-                if isinstance(block, AxisBlock):
-                    found.motion.append(block.z)
+                found.path.add(block)
                 if points is not None:
                     if nominal is not None and lateral:
                         points = with_lateral(points, nominal, lateral)
                     found.add(points, ply.write(points))
         return _correction(scan, found)
-
-
-class _Start:
-    """The first ``most`` values of a stream."""
-
-    def __init__(self, most: int) -> None:
-        self._missing = most
-        self._parts: list[FloatArray] = []
-
-    def append(self, values: FloatArray) -> None:
-        if self._missing > 0:
-            self._parts.append(values[: self._missing])
-            self._missing -= len(values)
-
-    def first(self) -> FloatArray:
-        return np.concatenate(self._parts) if self._parts else np.empty(0)
 
 
 class _Findings:
@@ -124,7 +106,7 @@ class _Findings:
         self._running = {name: RunningStatistics() for name in names}
         self.largest = 0.0
         self.drawn = EvenSelection(MOST_DRAWN)
-        self.motion = _Start(MOST_JUDGED)
+        self.path = PathStart(MOST_JUDGED)
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
         self.drawn.add(packed)
@@ -154,6 +136,6 @@ def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
         statistics=found.statistics(),
         largest_uncertainty=found.largest,
         points=found.drawn.rows(),
-        motion=found.motion.first(),
+        path=found.path.path(),
         sample_period=scan.sample_period,
     )

@@ -16,7 +16,6 @@ from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
-from omsm_ros.core.machine.limits import ScanPath
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
@@ -100,12 +99,10 @@ def summarise(bag: Path, done: Correction, calibration: Calibration) -> dict[str
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:
     """Was the scan slow enough to be trusted, and how good was H on its motion?"""
     try:
-        prediction = predict_error(
-            calibration, ScanPath(z=done.motion, sample_period=done.sample_period)
-        )
+        prediction = predict_error(calibration, done.path)
         digital = discretise(calibration.dynamics, done.sample_period)
         rms, spread = discretisation_error(
-            calibration.dynamics, digital, done.motion, calibration.valid_up_to
+            calibration.dynamics, digital, done.path.z, calibration.valid_up_to
         )
     except DataError as err:
         return {"warnings": [f"the motion could not be judged: {err}"]}

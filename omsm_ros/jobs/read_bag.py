@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from omsm_ros.core.machine.limits import ScanPath
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.machine.limits import PathStart, ScanPath
+from omsm_ros.core.samples.blocks import Block
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bags
+
+MOST_JUDGED = 2**20
+"""Samples of a path that are judged: a quarter of an hour at 1 kHz, of a spiral the fastest."""
 
 Progress = Callable[[int, int], None]
 """Called with messages done and messages in all."""
@@ -36,43 +37,17 @@ def read_blocks(
 # ------------------------------------------------------------------------------- preview
 
 
-def motion_in(
-    path: Path, progress: Progress = no_progress, most: int | None = None
-) -> tuple[FloatArray, float]:
-    """Z of a bag [m], its first ``most`` samples (None = all), and its sample period [s]."""
-    found: list[FloatArray] = []
-    samples, period = 0, 0.0
-    with bags.BagReader(path) as bag:
-        total = bag.count([bags.AXES_TOPIC])
-        for done, _, block in bag.blocks(bags.AXES_TOPIC):
-            found.append(block.z)
-            samples, period = samples + len(block), block.sample_period
-            progress(done, total)
-            if most is not None and samples >= most:
-                break
-    if not found:
-        raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
-    return np.concatenate(found)[:most], period
-
-
 def path_in(path: Path, progress: Progress = no_progress) -> ScanPath:
-    """Return the path that a bag holds, with its readings where it has some."""
+    """Return the start of the path that a bag holds, with its readings where it has some."""
+    start = PathStart(MOST_JUDGED)
     with bags.BagReader(path) as bag:
-        probed = any(t.topic == bags.DISTANCE_TOPIC and t.messages for t in bag.topics())
-    topics = [bags.AXES_TOPIC, *([bags.DISTANCE_TOPIC] if probed else [])]
-    blocks = read_blocks(path, topics, progress)
-    axes = [b for b in blocks[bags.AXES_TOPIC] if isinstance(b, AxisBlock)]
-    if not axes:
+        wanted = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
+        present = [t.topic for t in bag.topics() if t.messages and t.topic in wanted]
+        total = bag.count(present)
+        for done, _, block in bag.blocks(*present):
+            start.add(block)
+            progress(done, total)
+    found = start.path()
+    if found is None:
         raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
-    readings = [
-        np.where(b.ok, b.distance, np.nan)
-        for b in blocks.get(bags.DISTANCE_TOPIC, [])
-        if isinstance(b, DistanceBlock)
-    ]
-    return ScanPath(
-        z=np.concatenate([b.z for b in axes]),
-        sample_period=axes[0].sample_period,
-        x=np.concatenate([b.x for b in axes]),
-        c=np.concatenate([b.c for b in axes]),
-        distance=np.concatenate(readings) if readings else None,
-    )
+    return found

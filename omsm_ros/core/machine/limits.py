@@ -15,7 +15,7 @@ import numpy as np
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import Quantity
 from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
@@ -75,6 +75,33 @@ class ScanPath:
     x: FloatArray | None = None
     c: FloatArray | None = None
     distance: FloatArray | None = None
+
+
+class PathStart:
+    """The first samples of a path, gathered from the blocks of a stream while they pass."""
+
+    def __init__(self, most: int) -> None:
+        """``most`` samples of either stream are kept."""
+        self._most = most
+        self._axes: list[AxisBlock] = []
+        self._readings: list[FloatArray] = []
+
+    def add(self, block: Block) -> None:
+        """Take what is still wanted of ``block``."""
+        if isinstance(block, AxisBlock) and sum(map(len, self._axes)) < self._most:
+            self._axes.append(block)
+        elif isinstance(block, DistanceBlock) and sum(map(len, self._readings)) < self._most:
+            self._readings.append(np.where(block.ok, block.distance, np.nan))
+
+    def path(self) -> ScanPath | None:
+        """Return the path gathered so far; None if there were no axes."""
+        if not self._axes:
+            return None
+        z, x, c = (
+            np.concatenate([getattr(b, name) for b in self._axes])[: self._most] for name in "zxc"
+        )
+        distance = np.concatenate(self._readings)[: self._most] if self._readings else None
+        return ScanPath(z=z, sample_period=self._axes[0].sample_period, x=x, c=c, distance=distance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,12 +234,14 @@ def _following(path: ScanPath, limits: MachineLimits) -> SpeedLimit | str:
     def excursion(factor: float) -> float:
         return following_error(path.z, path.sample_period, servo, factor)
 
-    now, taken = excursion(1.0), 0.0
+    now, taken, share = excursion(1.0), 0.0, 1.0
     if path.distance is not None and np.any(np.isfinite(path.distance)):
-        # What the readings span already, beyond the servo's own error: shape, tilt, set-up.
-        taken = max(float(np.nanmax(np.abs(path.distance))) - now, 0.0)
-    factor = highest_factor(lambda k: excursion(k) + taken, limits.probe_range / 2)
-    return SpeedLimit(name, now + taken, limits.probe_range / 2, "m", factor)
+        span = float(np.nanmax(path.distance) - np.nanmin(path.distance)) / 2
+        # More than the servo's own error is shape, tilt and set-up, whatever the speed; less
+        # shows a servo that is better than declared.
+        taken, share = max(span - now, 0.0), min(span / now, 1.0) if now else 1.0
+    factor = highest_factor(lambda k: share * excursion(k) + taken, limits.probe_range / 2)
+    return SpeedLimit(name, share * now + taken, limits.probe_range / 2, "m", factor)
 
 
 def _spindle_rpm(path: ScanPath) -> float | None:

@@ -8,6 +8,7 @@ import pytest
 from omsm_ros.core.machine.limits import (
     FASTEST,
     MachineLimits,
+    PathStart,
     ScanPath,
     content_frequency,
     following_error,
@@ -16,6 +17,7 @@ from omsm_ros.core.machine.limits import (
     steepest,
 )
 from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
 
@@ -74,13 +76,52 @@ def test_the_papers_scan_at_1221_rpm_leaves_the_probes_range() -> None:
 
 
 def test_what_the_readings_span_already_is_not_there_for_following() -> None:
-    readings = np.full(len(SINE), 30e-6)
+    readings = 50e-6 + 30e-6 * (-1.0) ** np.arange(len(SINE))
     readings[5] = np.nan
     path = ScanPath(z=SINE, sample_period=PERIOD, distance=readings)
     free = ScanPath(z=SINE, sample_period=PERIOD)
     name, limits = "probe range against following error", MachineLimits(servo_frequency=200.0)
     assert limit(name, path, limits).speed_factor < limit(name, free, limits).speed_factor
     assert limit(name, path, limits).value == pytest.approx(30e-6)
+
+
+def test_readings_that_span_less_show_a_better_servo() -> None:
+    name, limits = "probe range against following error", MachineLimits(servo_frequency=50.0)
+    late = following_error(SINE, PERIOD, 50.0)
+    path = ScanPath(z=SINE, sample_period=PERIOD, distance=0.25 * late * np.sign(SINE))
+    found = limit(name, path, limits)
+    assert found.value == pytest.approx(0.25 * late, rel=1e-3)
+    at_that_speed = 0.25 * following_error(SINE, PERIOD, 50.0, found.speed_factor)
+    assert at_that_speed == pytest.approx(50e-6, rel=1e-3)
+
+
+def test_the_start_of_a_path_is_gathered_from_blocks() -> None:
+    start = PathStart(150)
+    assert start.path() is None
+    ramp = np.arange(100.0)
+    for first in (0, 100):
+        start.add(
+            AxisBlock(
+                stamp_ns=0,
+                first_sample=first,
+                sample_period=PERIOD,
+                **dict.fromkeys("xyzbc", first + ramp * 1e-06),
+            )
+        )
+        start.add(
+            DistanceBlock(
+                stamp_ns=0,
+                first_sample=first,
+                sample_period=PERIOD,
+                distance=ramp * 1e-9,
+                status=(ramp == 7).astype(np.uint8),
+            )
+        )
+    path = start.path()
+    assert path is not None
+    assert len(path.z) == len(path.c) == len(path.distance) == 150
+    assert path.x[149] == pytest.approx(100 + 49e-6)
+    assert np.flatnonzero(np.isnan(path.distance)).tolist() == [7, 107]
 
 
 def test_powers_of_the_speed() -> None:
