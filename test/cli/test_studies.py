@@ -114,7 +114,7 @@ def test_predict_says_what_the_scan_will_cost(capsys, small_scan, scan_bag, cali
     found = facts(capsys, "predict", scan_bag, "--calibration", calibration)
     truth = small_scan.probe_motion - small_scan.axes.z
     assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
-    assert found["safe"]
+    assert found["safe"], found["message"]
     assert found["speed_factor"] > 1
     # The noise of the encoder, on the small motion of this small scan.
     assert found["outside_band_fraction"] < 0.02

@@ -151,5 +151,5 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
     assert error.points == len(cloud)
     assert error.peak_to_valley == pytest.approx(np.ptp(cloud["dynamic_error"]), rel=1e-6)
     assert done.largest_uncertainty == pytest.approx(cloud["uncertainty"].max(), rel=1e-6)
-    assert len(done.motion) == 40_000
+    assert len(done.path.z) == 40_000
     assert done.sample_period == 1e-3

@@ -181,13 +181,23 @@ def _power(
 
 
 def content_frequency(z: FloatArray, sample_period: float) -> float:
-    """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies; 0 at rest."""
+    """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies; 0 at rest.
+
+    The encoder's white noise, as large as it is in the upper half of the band, is taken off.
+    """
     velocity = np.diff(z)
     power = np.abs(np.fft.rfft(velocity - np.mean(velocity))) ** 2
-    total = float(np.sum(power))
-    if total <= (1e-15 * float(np.max(np.abs(z), initial=0.0))) ** 2 * len(z) ** 2:
+    # White noise of z, differenced.
+    shape = 4 * np.sin(0.5 * np.pi * np.arange(len(power)) / (len(power) - 1)) ** 2
+    upper = slice(len(power) // 2, None)
+    # The power of a line of noise is exponentially distributed: its median is ln 2 of its mean.
+    noise = float(np.median(power[upper] / shape[upper])) / np.log(2) * shape
+    moved = power - noise
+    # Beyond five standard deviations of the noise's sum, something moves.
+    if np.sum(moved) <= 5 * float(np.linalg.norm(noise)):
         return 0.0
-    place = int(np.searchsorted(np.cumsum(power), _CONTENT_SHARE * total))
+    gathered = np.cumsum(moved)
+    place = int(np.argmax(gathered >= _CONTENT_SHARE * gathered[-1]))
     return float(place / (len(velocity) * sample_period))
 
 

@@ -52,6 +52,13 @@ def test_content_of_a_sine_is_its_frequency_and_of_a_rest_none() -> None:
     assert content_frequency(np.full(1000, 0.02), PERIOD) == 0.0
 
 
+def test_noise_of_the_encoder_is_no_content() -> None:
+    noise = np.random.default_rng(2).normal(0, 1e-9, len(SINE))
+    assert content_frequency(noise, PERIOD) == 0.0
+    # Here the noise holds half of the mean square velocity.
+    assert content_frequency(1e-3 * SINE + noise, PERIOD) < 20.0
+
+
 @pytest.mark.parametrize("servo", [50.0, 200.0])
 @pytest.mark.parametrize("factor", [1.0, 7.0])
 def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: float) -> None:
@@ -105,7 +112,7 @@ def test_the_start_of_a_path_is_gathered_from_blocks() -> None:
                 stamp_ns=0,
                 first_sample=first,
                 sample_period=PERIOD,
-                **dict.fromkeys("xyzbc", first + ramp * 1e-06),
+                **dict.fromkeys("xyzbc", first / 100 + ramp * 1e-6),
             )
         )
         start.add(
@@ -120,7 +127,7 @@ def test_the_start_of_a_path_is_gathered_from_blocks() -> None:
     path = start.path()
     assert path is not None
     assert len(path.z) == len(path.c) == len(path.distance) == 150
-    assert path.x[149] == pytest.approx(100 + 49e-6)
+    assert path.x[149] == pytest.approx(1 + 49e-6)
     assert np.flatnonzero(np.isnan(path.distance)).tolist() == [7, 107]
 
 
