@@ -103,7 +103,6 @@ def residual(fitted: FittedRecord, noise: float | None) -> Figure:
     if at_edges is not None:
         _draw_at_edges(axes[1, 0], at_edges, noise)
     _draw_correlation(axes[-1, 0], fitted.residual)
-    made.align_ylabels()
     return made
 
 

@@ -50,7 +50,6 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     draw_phase(phase, frequency, identified, true)
     phase.set_xlabel("")
     _draw_error(error, frequency, identified, true)
-    made.align_ylabels()
     return made
 
 
@@ -196,7 +195,6 @@ def step_response(
     style.label(lower, x="time since it began [ms]", y="error [nm]")
     style.legend_above(upper)
     style.legend_above(lower)
-    made.align_ylabels()
     return made
 
 

@@ -134,7 +134,6 @@ def profile(
     style.legend_above(upper)
     style.label(upper, y="deviation [µm]", title=title)
     style.label(lower, x=f"{position} [mm]", y="deviation [nm]")
-    made.align_ylabels()
     return made
 
 
@@ -175,7 +174,6 @@ def dynamic_error(
         style.legend_above(lower)
         style.label(lower, y="after [nm]")
     style.label(lower, x="time [s]", y=lower.get_ylabel())
-    made.align_ylabels()
     return made
 
 

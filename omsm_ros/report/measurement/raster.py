@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from numpy.typing import NDArray
 
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.errors import DataError
 
 MAX_PIXELS = 400
 _POINTS_PER_PIXEL = 2
+# Beyond any image, and its square still a whole number.
+_FAR = 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +59,54 @@ def _pixel(position: FloatArray, pitch: float) -> tuple[IntArray, int]:
 
 
 def _close_gaps(total: FloatArray, count: FloatArray) -> FloatArray:
-    away = ndimage.distance_transform_edt(count == 0)
-    # Between tracks a pixels apart half of all pixels are within a/4 of one.
-    reach = max(2.5 * float(np.median(away)), 1.5)
-    spread = [ndimage.gaussian_filter(part, reach / 2, mode="constant") for part in (total, count)]
+    away, reach = _near(count > 0)
+    spread = [smoothed(part, reach / 2) for part in (total, count)]
     with np.errstate(invalid="ignore", divide="ignore"):
         image = np.where(count > 0, total / count, spread[0] / spread[1])
     return np.where(away <= reach, image, np.nan)
+
+
+def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+    """Pixels to the nearest filled one, exact up to the reach of a gap that is to be closed."""
+    within = 2
+    while True:
+        away = distances(filled, within)
+        # Between tracks a pixels apart half of all pixels are within a/4 of one.
+        reach = max(2.5 * float(np.median(away)), 1.5)
+        if reach <= within or within >= max(filled.shape):
+            return away, reach
+        within *= 2
+
+
+def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
+    """Pixels to the nearest filled pixel of an image (rows, columns), at least one of which is.
+
+    First along the columns, then the least sum of squares over the columns beside. Exact where
+    it is no more than ``within``, elsewhere never less than the truth.
+    """
+    rows, columns = filled.shape
+    row = np.arange(rows)[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(filled, row, -_FAR), axis=0)
+    after = np.minimum.accumulate(np.where(filled, row, _FAR)[::-1], axis=0)[::-1]
+    along = np.minimum(row - before, after - row).astype(np.float64) ** 2
+    nearest = along.copy()
+    for aside in range(1, min(within + 1, columns)):
+        left, right = slice(None, -aside), slice(aside, None)
+        nearest[:, left] = np.minimum(nearest[:, left], along[:, right] + aside**2)
+        nearest[:, right] = np.minimum(nearest[:, right], along[:, left] + aside**2)
+    return np.sqrt(nearest)
+
+
+def smoothed(image: FloatArray, sigma: float) -> FloatArray:
+    """The image under a Gaussian of ``sigma`` pixels, cut off at four of them; zero beyond."""
+    rows, columns = (_gaussian(size, sigma) for size in image.shape)
+    return np.asarray(rows @ image @ columns, np.float64)
+
+
+def _gaussian(size: int, sigma: float) -> FloatArray:
+    """Weights (size, size) of each pixel of a line for each other one."""
+    cut = int(4 * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(max(size, cut + 1)) / sigma) ** 2)
+    weights[cut + 1 :] = 0.0
+    apart = abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    return np.asarray((weights / (2 * weights.sum() - weights[0]))[apart])
