@@ -28,7 +28,9 @@ from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
 from omsm_ros.twin.cell import Cell, Recording, blocks_of, record
+from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, step_test_of
 from omsm_ros.units import MICROSECOND_S, NANOMETRE_M
 
@@ -328,7 +330,8 @@ def lateral_lag() -> list[Row]:
     """A probe 0.34 ms late, found by turning the spindle the other way."""
     latency = 0.34e-3
     prompt = TransferFunction(np.ones(1), np.array([1.0, 1 / (2 * np.pi * 5000)]))
-    cell = Cell(plant=Plant(dynamics=prompt), latency=latency)
+    late = Disturbances(probe=ProbeErrors(latency_s=latency))
+    cell = Cell(plant=Plant(dynamics=prompt), disturbances=late)
     calibration = replace(
         true_calibration(),
         dynamics=TransferFunction(prompt.numerator, prompt.denominator, latency),

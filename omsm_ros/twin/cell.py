@@ -7,7 +7,7 @@ and the encoder's noise, is what ``Disturbances`` lists; what is not stands in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,7 @@ __all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
 class Cell:
     """Everything that decides what the devices report.
 
-    encoder_noise: standard deviation [m];  drift: of the fixture [m/s]
-    latency: how late the probe's reading is [s]: it tells of the place it saw that long ago
+    encoder_noise: standard deviation [m]
     sample_period: of the common trigger [s];  seed: of all noise
     disturbances: what else is not as it should be
     """
@@ -41,15 +40,11 @@ class Cell:
     plant: Plant = field(default_factory=Plant)
     probe: Probe = field(default_factory=Probe)
     encoder_noise: float = 0.4 * NANOMETRE_M
-    drift: float = 0.0
-    latency: float = 0.0
     sample_period: float = 1e-3
     seed: int = 1
     disturbances: Disturbances = field(default_factory=Disturbances)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.latency < np.inf:
-            raise ConfigurationError(f"latency {self.latency!r} s, expected zero or positive")
         if not self.sample_period > 0:
             raise ConfigurationError(f"sample_period {self.sample_period!r} s is not positive")
 
@@ -109,7 +104,7 @@ def record(
     ``scale · (surface - probe motion - stand_off)``, rounded, and a lost target beyond range.
     """
     random = _random_streams(cell.seed)
-    errors = _with_the_cells_own(cell)
+    errors = cell.disturbances
     timing = Timing(round(motion.duration / cell.sample_period), cell.sample_period, substeps)
     scene = scene_of(cell.plant, errors, motion, surface, stand_off, timing, random)
     nominal = np.arange(timing.samples) * cell.sample_period
@@ -144,18 +139,6 @@ def _random_streams(seed: int) -> dict[str, np.random.Generator]:
     """Independent random numbers for each use, so that switching one on leaves the others."""
     children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
-
-
-def _with_the_cells_own(cell: Cell) -> Disturbances:
-    """All disturbances, the latency and drift that the cell names itself among them."""
-    errors = cell.disturbances
-    drift = errors.machine.drift
-    drift = replace(drift, ramp_m_per_s=drift.ramp_m_per_s + cell.drift)
-    return replace(
-        errors,
-        probe=replace(errors.probe, latency_s=errors.probe.latency_s + cell.latency),
-        machine=replace(errors.machine, drift=drift),
-    )
 
 
 def _axes(cell: Cell, scene: Scene, when: Instants, random: np.random.Generator) -> AxisBlock:

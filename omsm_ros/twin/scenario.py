@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from omsm_ros.core.machine.trajectories import Spiral, StepTest
+import numpy as np
+
+from omsm_ros.core.machine.trajectories import Motion, Spiral, StepTest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
@@ -14,9 +16,11 @@ from omsm_ros.twin.part_pose import PartPose
 
 @dataclass(frozen=True)
 class Scenario:
-    """What the cell does.
+    """What the cell does, and on what.
 
+    seed: of all that is random;  part_seed: of the part's figure, None takes ``seed``
     spindle_speed: [rpm];  feed_per_turn, start_radius: [m];  step_rise, sample_period: [s]
+    tool_marks: peak to valley of what the turning tool has left on the part [m]
     """
 
     seed: int = 1
@@ -25,29 +29,43 @@ class Scenario:
     start_radius: float = PAPER_MIRROR_RADIUS_M
     step_rise: float = 20e-3
     sample_period: float = 1e-3
+    part_seed: int | None = None
+    tool_marks: float = 0.0
+
+    @property
+    def part(self) -> FigureError:
+        """The mirror as it really is; scans of one ``part_seed`` see the same."""
+        seed = self.seed if self.part_seed is None else self.part_seed
+        return FigureError(
+            PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, seed=seed, tool_marks=self.tool_marks
+        )
 
 
 def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """The step test on a fixed flat, its middle in the middle of the probe's range.
+    """The paper's step test on a fixed flat."""
+    return on_a_flat(scenario, StepTest(rise=scenario.step_rise), disturbances)
+
+
+def on_a_flat(
+    scenario: Scenario, motion: Motion, disturbances: Disturbances = NOTHING
+) -> Recording:
+    """A ``motion`` before a fixed flat, its middle in the middle of the probe's range.
 
     The flat is no part: it has no pose.
     """
-    motion = StepTest(rise=scenario.step_rise)
-    middle = motion.count * motion.step / 2
-    on_a_flat = replace(disturbances, machine=replace(disturbances.machine, pose=PartPose()))
-    cell = Cell(seed=scenario.seed, sample_period=scenario.sample_period, disturbances=on_a_flat)
-    return record(cell, motion, Flat(), stand_off=-middle)
+    z = motion.positions(np.arange(0.0, motion.duration, scenario.sample_period)).z
+    fixed = replace(disturbances, machine=replace(disturbances.machine, pose=PartPose()))
+    cell = Cell(seed=scenario.seed, sample_period=scenario.sample_period, disturbances=fixed)
+    return record(cell, motion, Flat(), stand_off=-float(z.max() + z.min()) / 2)
 
 
 def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """The spiral over the paper's mirror, as it really is."""
-    motion = spiral_of(scenario)
     # Another seed than the step test's: the same noise twice would be no independent check.
     cell = Cell(
         seed=scenario.seed + 1, sample_period=scenario.sample_period, disturbances=disturbances
     )
-    made = FigureError(PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, scenario.seed)
-    return record(cell, motion, made)
+    return record(cell, spiral_of(scenario), scenario.part)
 
 
 def spiral_of(scenario: Scenario) -> Spiral:

@@ -8,6 +8,8 @@ from omsm_ros.core.samples.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, blocks_of, record
+from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.machine_errors import Drift, MachineErrors
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
 
 MIDDLE = -49e-6
@@ -38,11 +40,12 @@ def test_beyond_its_range_the_probe_sees_nothing():
 
 
 def test_drift_moves_the_target():
+    drift = Disturbances(machine=MachineErrors(drift=Drift(ramp_m_per_s=100e-9 / 60)))
+    quiet = Probe(noise=0.0, resolution=0.0)
     still, drifting = (
-        record(Cell(drift=d, probe=Probe(noise=0.0, resolution=0.0)), StepTest(), Flat(),
-               stand_off=MIDDLE)
-        for d in (0.0, 100e-9 / 60)
-    )  # fmt: skip
+        record(Cell(disturbances=d, probe=quiet), StepTest(), Flat(), stand_off=MIDDLE)
+        for d in (NOTHING, drift)
+    )
     moved = drifting.distance.distance - still.distance.distance
     expected = PAPER_STATIC_GAIN * 100e-9 / 60 * np.arange(len(moved)) * 1e-3
     np.testing.assert_allclose(moved, expected, atol=1e-15)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,15 @@ def test_a_perfectly_corrected_scan_finds_it():
     found = form.deviation(x, y, height, PAPER_MIRROR)
     assert np.abs(found - mirror.error(x, y)).max() < 1e-15
     assert np.ptp(found) > 80e-9
+
+
+def test_tool_marks_are_parabolas_from_cusp_to_cusp():
+    bare = FigureError(Flat(), RADIUS, astigmatism=0.0, trefoil=0.0, ripple=0.0)
+    marked = replace(bare, tool_marks=8e-9)
+    radius = np.linspace(1e-3, 1.3e-3, 30_001)
+    height = marked.error(radius, np.zeros_like(radius))
+    assert np.ptp(height) == pytest.approx(8e-9, rel=1e-6)
+    # A round tool of radius R leaves scallops of feed² / 8R: R is 3.5 mm here.
+    bend = np.diff(height, 2) / (radius[1] - radius[0]) ** 2
+    assert np.median(bend) == pytest.approx(8 * 8e-9 / 15e-6**2, rel=1e-3)
+    assert np.all(bare.error(radius, radius) == 0)

@@ -22,6 +22,8 @@ from omsm_ros.errors import (
     StepTestError,
 )
 from omsm_ros.twin.cell import Cell, blocks_of, record
+from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.machine_errors import Drift, MachineErrors
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 STAND_OFF = -49e-6
@@ -31,7 +33,8 @@ TRUTH = PLANT.dynamics
 
 @lru_cache(maxsize=64)
 def recorded(seed=1, motion=STEPS, plant=PLANT, sample_period=1e-3, drift=0.0):
-    cell = Cell(plant=plant, seed=seed, sample_period=sample_period, drift=drift)
+    drifting = Disturbances(machine=MachineErrors(drift=Drift(ramp_m_per_s=drift)))
+    cell = Cell(plant=plant, seed=seed, sample_period=sample_period, disturbances=drifting)
     return record(cell, motion, Flat(), stand_off=STAND_OFF)
 
 

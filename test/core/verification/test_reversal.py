@@ -17,7 +17,9 @@ from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
 from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+from omsm_ros.twin.probe import ProbeErrors
 
 LATENCY = 0.34e-3
 PERIOD = 1e-3
@@ -58,7 +60,9 @@ def scan(
     return ScanPath.of(join_points([corrector.finish()]), PERIOD)
 
 
-LATE_CELL = Cell(plant=Plant(dynamics=PROMPT), latency=LATENCY)
+LATE_CELL = Cell(
+    plant=Plant(dynamics=PROMPT), disturbances=Disturbances(probe=ProbeErrors(latency_s=LATENCY))
+)
 
 
 @pytest.fixture(scope="module")
