@@ -76,16 +76,21 @@ class Quantity:
         good = (values >= self.low) & (values <= self.high)
         return None if np.all(good) else np.asarray(good, np.bool_)
 
+    @property
+    def range_text(self) -> str:
+        """The range in words, with its unit."""
+        sign, unit = "±" if self.signed else "", f" {self.unit}" if self.unit else ""
+        return f"from {sign}{self.low:g} to {sign}{self.high:g}{unit}"
+
     def _holds(self, number: float) -> bool:
         return self.low <= (abs(number) if self.signed else number) <= self.high
 
     def _refusal(self, value: object, name: str) -> str:
         unit = f" {self.unit}" if self.unit else ""
         kind = "a whole number" if self.whole else "a number"
-        sign = "±" if self.signed else ""
         return (
-            f"{name or self.name} is {shown(value)}{unit}, expected {kind} from "
-            f"{sign}{self.low:g} to {sign}{self.high:g}{unit}; {self.remedy}"
+            f"{name or self.name} is {shown(value)}{unit}, expected {kind} {self.range_text}; "
+            f"{self.remedy}"
         )
 
 
@@ -168,6 +173,10 @@ EXPOSURE = Quantity("exposure", "s", 0.0, 10.0, "give it in seconds")
 DWELL = Quantity("dwell", "s", 1e-6, 100.0, "give it in seconds")
 RISE = Quantity("rise", "s", 1e-7, 100.0, "give it in seconds")
 
+# An hour at 20 kHz; five channels of it are three gigabytes.
+BUFFER_SAMPLES = Quantity(
+    "samples kept", "", 1000, 72_000_000, "keep as many as memory holds", whole=True
+)
 COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")

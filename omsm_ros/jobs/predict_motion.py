@@ -12,6 +12,7 @@ from omsm_ros.core.machine.limits import ScanPath
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
 from omsm_ros.jobs.read_bag import path_in
+from omsm_ros.quantities import POSITION, SAMPLE_PERIOD
 
 
 def predict_from(
@@ -22,6 +23,6 @@ def predict_from(
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
         return predict_error(calibration, path_in(Path(bag)))
-    return predict_error(
-        calibration, ScanPath(z=np.asarray(z, np.float64), sample_period=sample_period)
-    )
+    SAMPLE_PERIOD.checked(sample_period, name="sample_period")
+    positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
+    return predict_error(calibration, ScanPath(z=positions, sample_period=sample_period))

@@ -23,8 +23,10 @@ from omsm_ros.nodes.running import (
     Diagnostics,
     parameter,
     run,
+    serve,
     settings_of,
 )
+from omsm_ros.quantities import BUFFER_SAMPLES, DURATION, ORDER
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_file import save_calibration
 
@@ -34,7 +36,9 @@ class CalibratorNode(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator", namespace=NAMESPACE)
-        capacity = parameter(self, "buffer_samples", 3_600_000, "samples kept per topic")
+        capacity = parameter(
+            self, "buffer_samples", 3_600_000, "samples kept per topic", BUFFER_SAMPLES
+        )
         self._output = parameter(
             self, "output", "calibration.json", "where to write the calibration"
         )
@@ -59,7 +63,7 @@ class CalibratorNode(Node):
                 lambda message, into=buffer: self._on_distance(message, into),
                 SAMPLES_QOS,
             )
-        self.create_service(Identify, "~/identify", self._on_identify)
+        serve(self, Identify, "~/identify", self._on_identify)
         self._diagnostics = Diagnostics(self, self._report)
 
     def _on_axes(self, message: AxisBlock) -> None:
@@ -75,9 +79,8 @@ class CalibratorNode(Node):
             self._refused += 1
             self.get_logger().warning(f"block refused: {err}", throttle_duration_sec=5.0)
 
-    def _on_identify(
-        self, request: Identify.Request, response: Identify.Response
-    ) -> Identify.Response:
+    def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
+        self._last = "identification failed, see the log"
         try:
             identified = self._identify(request)
             calibration = identified.calibration
@@ -86,7 +89,7 @@ class CalibratorNode(Node):
             )
             response.success, self._last = self._judge(calibration)
             self._last += self._certified(request, identified)
-        except (OmsmError, OSError) as err:
+        except OmsmError as err:
             response.success, self._last = False, f"identification failed: {err}"
         if response.success:
             self._publisher.publish(response.calibration)
@@ -94,7 +97,6 @@ class CalibratorNode(Node):
         else:
             self.get_logger().error(self._last)
         response.message = self._last
-        return response
 
     def _judge(self, calibration: Calibration) -> tuple[bool, str]:
         verdict, reasons = verdict_of(calibration)
@@ -117,25 +119,26 @@ class CalibratorNode(Node):
                 identified,
                 source=Path(request.bag).name or "live recording",
             )
-        except (OmsmError, OSError) as err:
+        except OmsmError as err:
             return f"; no certificate: {err}"
         return f"; certificate in {page}"
 
     def _identify(self, request: Identify.Request) -> Identification:
         return identify(
             self._motion(request),
-            order=request.order,
+            order=ORDER.checked(request.order),
             input=request.input or "encoder",
             settings=self._settings,
         )
 
     def _motion(self, request: Identify.Request) -> MotionRecord:
+        duration = DURATION.checked(request.duration)
         if request.bag:
-            return motion_of_bag(Path(request.bag), duration=request.duration)
+            return motion_of_bag(Path(request.bag), duration=duration)
         return assemble(
-            self._axes.recent(request.duration),
-            self._distance.recent(request.duration),
-            self._reference.recent(request.duration),
+            self._axes.recent(duration),
+            self._distance.recent(duration),
+            self._reference.recent(duration),
         )
 
     def _report(self) -> tuple[bytes, str, dict[str, object]]:

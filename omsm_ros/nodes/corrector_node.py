@@ -31,6 +31,7 @@ from omsm_ros.nodes.running import (
     Diagnostics,
     parameter,
     run,
+    serve,
     settings_of,
 )
 from omsm_ros.storage import conversions
@@ -81,8 +82,8 @@ class CorrectorNode(Node):
             )
         self.create_subscription(AxisBlock, "axes", self._on_axes, SAMPLES_QOS)
         self.create_subscription(DistanceBlock, "confocal", self._on_distance, SAMPLES_QOS)
-        self.create_service(LoadCalibration, "~/load_calibration", self._on_load)
-        self.create_service(PredictError, "~/predict_error", self._on_predict)
+        serve(self, LoadCalibration, "~/load_calibration", self._on_load)
+        serve(self, PredictError, "~/predict_error", self._on_predict)
         self._diagnostics = Diagnostics(self, self._report)
         if not path:
             self.get_logger().info("no calibration yet: nothing will be published")
@@ -109,6 +110,7 @@ class CorrectorNode(Node):
             name: parameter(self, f"sources.{name}", 0.0, "SI, k = 1; 0 = certificate")
             for name in SOURCES
         }
+        ErrorSources(**stated)  # refuses what is no uncertainty
         return {name: value for name, value in stated.items() if value}
 
     # ------------------------------------------------------------------- calibration
@@ -118,14 +120,15 @@ class CorrectorNode(Node):
             calibration, settings=self._settings or None, polarity=self._options.polarity
         )
         admit(calibration, reasons, self._override)
+        sources = sources_with(calibration, self._sources)
+        corrector = Corrector(calibration, replace(self._options, sources=sources))
+        # Nothing is refused from here on: the calibration in force is one, wholly.
         self._publish_rest()
         # A viewer that waits for the usual frame shows nothing until somebody has seen why.
         self._frame = OVERRIDDEN_FRAME if reasons else FRAME
         for reason in reasons:
             self.get_logger().warning(f"overridden: {reason}")
-        self._calibration = calibration
-        sources = sources_with(calibration, self._sources)
-        self._corrector = Corrector(calibration, replace(self._options, sources=sources))
+        self._calibration, self._corrector = calibration, corrector
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
 
     def _publish_rest(self) -> None:
@@ -143,32 +146,19 @@ class CorrectorNode(Node):
 
     def _on_load(
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
-    ) -> LoadCalibration.Response:
-        try:
-            self._use(load_calibration(Path(request.path)))
-        except OmsmError as err:
-            response.success, response.message = False, str(err)
-        else:
-            response.success, response.message = True, "in use"
+    ) -> None:
         response.id = self._calibration.id if self._calibration else ""
-        return response
+        self._use(load_calibration(Path(request.path)))
+        response.success, response.message = True, "in use"
+        response.id = self._calibration.id if self._calibration else ""
 
-    def _on_predict(
-        self, request: PredictError.Request, response: PredictError.Response
-    ) -> PredictError.Response:
-        try:
-            prediction = predict_from(
-                self._calibration, request.bag, request.z, request.sample_period
-            )
-        except OmsmError as err:
-            response.safe, response.message = False, str(err)
-            return response
+    def _on_predict(self, request: PredictError.Request, response: PredictError.Response) -> None:
+        prediction = predict_from(self._calibration, request.bag, request.z, request.sample_period)
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
         response.outside_band_fraction = prediction.outside_band_fraction
         response.safe = prediction.safe
         response.message = prediction.message
-        return response
 
     # ----------------------------------------------------------------------- samples
 

@@ -1,0 +1,148 @@
+"""No message, request or parameter ends a node, or stalls it."""
+
+import array
+import os
+import subprocess
+import sys
+
+import pytest
+from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
+from omsm_msgs.srv import Identify, LoadCalibration, PredictError
+
+from omsm_ros.nodes.running import LATCHED_QOS
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import save_calibration
+
+NAN, INF = float("nan"), float("inf")
+WAVE = [1e-6 * (k % 50) for k in range(400)]
+
+
+@pytest.fixture
+def files(tmp_path, true_calibration):
+    """Paths that are no bag and no calibration, and one that is."""
+    folder = tmp_path / "files"
+    folder.mkdir()
+    save_calibration(folder / "cal.json", true_calibration)
+    os.mkfifo(folder / "pipe.mcap")
+    (folder / "8.mcap").write_bytes(b"8 bytes.")
+    (folder / "text.json").write_text("root:x:0:0")
+    names = ("pipe.mcap", "8.mcap", "text.json", "n" * 300, "none", "")
+    return folder, [str(folder / name) for name in names] + ["/dev/zero", "/etc/passwd", "/", "."]
+
+
+def test_hostile_calls_are_answered_and_survived(cell, files):
+    folder, paths = files
+    good = str(folder / "cal.json")
+    cell.processes.start("corrector", calibration=good)
+    cell.processes.start("calibrator", output=str(folder / "new.json"))
+    assert cell.call(LoadCalibration, "corrector/load_calibration", path=good).success
+    for path in paths:
+        answer = cell.call(LoadCalibration, "corrector/load_calibration", path=path)
+        assert not answer.success
+        assert answer.message
+        assert "root:" not in answer.message
+        assert answer.id  # the good one stays in force
+        assert cell.call(PredictError, "corrector/predict_error", bag=path or "x").message
+        answer = cell.call(Identify, "calibrator/identify", bag=path or "x")
+        assert not answer.success
+        assert answer.message.startswith("identification failed: ")
+    for period in (1e300, 1e-300, 0.0, -1.0, NAN, INF, 5e-324):
+        answer = cell.call(PredictError, "corrector/predict_error", z=WAVE, sample_period=period)
+        assert not answer.safe
+        assert "sample_period" in answer.message
+        answer = cell.call(Identify, "calibrator/identify", duration=-period or NAN)
+        assert not answer.success
+    for z in ([], [0.0], [NAN] * 400, [1e300] * 400, [INF, *WAVE]):
+        answer = cell.call(PredictError, "corrector/predict_error", z=z, sample_period=1e-3)
+        assert not answer.safe
+        assert answer.message
+    for order in (21, 2**31, 2**32 - 1):
+        assert not cell.call(Identify, "calibrator/identify", order=order).success
+    answer = cell.call(PredictError, "corrector/predict_error", z=WAVE, sample_period=1e-3)
+    assert answer.peak_to_valley > 0
+    for node in ("corrector", "calibrator"):
+        assert cell.operator.value(node, "defects") == 0
+    cell.processes.check()
+
+
+def hostile_calibrations(good):
+    """Messages of a calibration with one thing wrong each, signed where they can be."""
+    changes = [
+        {"numerator": [NAN, 1.0]}, {"numerator": [0.0]}, {"numerator": []}, {"numerator": [5.0]},
+        {"denominator": [1.0, 1e6, 1e-6]}, {"denominator": [1.0, -1e-3]}, {"denominator": []},
+        {"denominator": [1.0] * 5000}, {"delay": 1000.0}, {"delay": NAN}, {"static_gain": INF},
+        {"sample_period": 1e-300}, {"sample_period": 0.0}, {"valid_up_to": NAN},
+        {"covariance": [NAN] * 49}, {"covariance": [1e300] * 49}, {"covariance": []},
+        {"settings": "[" * 100_000}, {"settings": "NaN"}, {"certificate": '{"verdict": null}'},
+        {"certificate": '{"noise_m": 1e999}'}, {"id": "x" * 10_000},
+    ]  # fmt: skip
+    for change in changes:
+        message = conversions.calibration_message(conversions.ros_messages(), good, 0)
+        for name, value in change.items():
+            is_array = isinstance(value, list)
+            setattr(message, name, array.array("d", value) if is_array else value)
+        yield message
+
+
+def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small_scan_blocks):
+    cell.processes.start("corrector")
+    cell.processes.start("calibrator")
+    latched = cell.operator.create_publisher(Calibration, "/omsm/calibration", LATCHED_QOS)
+    cell.wait("the corrector to listen", lambda: latched.get_subscription_count() >= 1)
+    for message in hostile_calibrations(true_calibration):
+        latched.publish(message)
+    messages = conversions.ros_messages()
+    latched.publish(conversions.calibration_message(messages, true_calibration, 0))
+    cell.wait(
+        "the good calibration to be taken",
+        lambda: cell.operator.text("corrector", "calibration") == true_calibration.id,
+    )
+    axes = cell.publisher("axes", AxisBlock, 2)
+    distance = cell.publisher("confocal", DistanceBlock, 2)
+    for pair in small_scan_blocks[:20]:
+        for period, first in ((1e300, 0), (1e-300, 0), (NAN, 0), (1e-3, 2**64 - 1), (1e-3, 2**53)):
+            for to, make, block in zip(
+                (axes, distance),
+                (conversions.axis_message, conversions.distance_message),
+                pair,
+                strict=True,
+            ):
+                message = make(messages, block)
+                message.sample_period, message.first_sample = period, first
+                to.publish(message)
+        axes.publish(conversions.axis_message(messages, pair[0]))
+        distance.publish(conversions.distance_message(messages, pair[1]))
+    cell.wait(
+        "the good blocks to be counted",
+        lambda: cell.operator.value("corrector", "axes_received") >= 2000,
+    )
+    assert cell.settle("corrector", "axes_refused") > 0
+    assert cell.operator.value("corrector", "axes_corrected") > 0
+    assert cell.operator.value("corrector", "defects") == 0
+    cell.processes.check()
+
+
+@pytest.mark.parametrize(
+    ("node", "parameter", "named"),
+    [
+        ("corrector", "geometry.centre_x:=1.0e6", "centre_x"),
+        ("corrector", "geometry.beam_x:=.nan", "beam_x"),
+        ("corrector", "lateral_lag:=1.0e9", "lateral_lag"),
+        ("corrector", "sources.probe_noise:=-1.0", "probe_noise"),
+        ("corrector", "settings:='[1]'", "settings"),
+        ("corrector", "calibration:=/dev/zero", "no regular file"),
+        ("calibrator", "buffer_samples:=-7", "buffer_samples"),
+        ("calibrator", "buffer_samples:=many", "buffer_samples"),
+    ],
+)
+def test_a_wrong_parameter_is_one_line_and_exit_2(node, parameter, named):
+    done = subprocess.run(
+        [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", "-p", parameter],
+        capture_output=True,
+        text=True,
+        timeout=50,
+    )
+    assert done.returncode == 2, done.stderr
+    line = done.stderr.strip().splitlines()[-1]
+    assert named in line
+    assert "Traceback" not in done.stderr
