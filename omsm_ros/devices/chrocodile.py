@@ -1,4 +1,4 @@
-"""A Precitec CHRocodile in the dollar protocol, over a serial line or TCP: set up and read.
+"""Precitec CHRocodile: what the drivers of both its protocols have in common.
 
 Untried on hardware. What the public facts leave open is a setting or is read tolerantly.
 """
@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import IntArray
 from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError, ProtocolError
-from omsm_ros.protocols.chrocodile import QUERY, Answer, DollarStream, command
-from omsm_ros.protocols.chrocodile_decoder import BinaryDecoder, LineDecoder
+from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+from omsm_ros.protocols.chrocodile import QUERY, Answer
 from omsm_ros.protocols.chrocodile_readings import (
     ENCODER_RANGE,
     LATCHES,
@@ -35,20 +33,16 @@ from omsm_ros.protocols.chrocodile_telegram import (
     SAMPLE_COUNTER,
     START_TIME,
     SYNC,
-    Layout,
     Records,
 )
 from omsm_ros.protocols.generic_stream import AxisScaling
-from omsm_ros.units import MICROMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.units import MICROMETRE_M
 
 TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
 FORMATS = {"binary": "BIN", "ascii": "ASC"}
 # In `TRE` the device's own rate must be just above that of the trigger.
 _ABOVE_TRIGGER = 1.05
 _COUNTER_RANGE = 2**16
-_TIME_RANGE = 2**32
-# Start bit, eight data bits, stop bit.
-_BITS_PER_BYTE = 10
 _READ_S = 0.05
 
 
@@ -95,20 +89,16 @@ class ChrocodileSettings(BlockSettings):
                 "it lost samples would not show"
             )
 
-    @property
-    def selection(self) -> tuple[int, ...]:
-        """Signals to ask for."""
-        if self.signals:
-            return self.signals
-        encoders = sum(LATCHES[self.latch], ()) if self.axes is not None else ()
-        return (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY, *encoders)
 
-
-class ChrocodileDevice(StreamDevice):
-    """Sets the device up, reads back what was set, and reads its telegrams.
+class Chrocodile(StreamDevice):
+    """Sets the device up, reads back what was set, and turns its signals into samples.
 
     triggers_lost, triggers_delayed: samples the device flagged so
     """
+
+    # What is asked for when no signals are given.
+    usual: tuple[int, ...] = (SAMPLE_COUNTER, FLAGS, DISTANCE, INTENSITY)
+    always_timed = False
 
     def __init__(
         self,
@@ -119,24 +109,25 @@ class ChrocodileDevice(StreamDevice):
     ) -> None:
         settings = settings or ChrocodileSettings()
         free = settings.trigger == "free_run"
-        settings = replace(settings, free_running=free)
-        timed = START_TIME in settings.selection
-        channels = Channels(axes=_wrapping(settings.axes), timed=timed)
+        encoders = sum(LATCHES[settings.latch], ()) if settings.axes is not None else ()
+        selection = settings.signals or (*self.usual, *encoders)
+        timed = self.always_timed or START_TIME in selection
         period = settings.sample_period if free else 0.0
-        counting = Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period)
-        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        super().__init__(
+            transport,
+            replace(settings, free_running=free),
+            Channels(axes=_wrapping(settings.axes), timed=timed),
+            Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period),
+            now_ns,
+            monotonic,
+        )
         self.triggers_lost = self.triggers_delayed = 0
         self._wanted = settings
+        self._selection = self._signals = selection
         self._probe = settings.probe
-        self._stream = DollarStream()
-        self._signals: tuple[int, ...] = settings.selection
-        self._early: list[Records] = []
         self._identity: dict[str, str] = {}
         self._asked = 0.0
         self._ever_set_up = False
-        self._raw_time: int | None = None
-        self._device_ns = 0
-        self._time_at = 0.0
 
     @property
     def identity(self) -> dict[str, str]:
@@ -145,27 +136,35 @@ class ChrocodileDevice(StreamDevice):
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        decoder = self._stream.decoder
-        wire = asdict(decoder.statistics) if decoder is not None else {}
         flags = {"triggers_lost": self.triggers_lost, "triggers_delayed": self.triggers_delayed}
-        return super().counts() | wire | flags
+        return super().counts() | flags
 
     def dark_reference(self) -> None:
         """Take the dark reference: no target may be in range. It lasts about three seconds."""
         self._ask("DRK", patience=self._wanted.patience + 8.0)
 
+    # --- what a protocol fills in
+
+    def _begin(self) -> None:
+        """Make the device listen; raises DeviceError."""
+
+    def _finish(self) -> None:
+        """Make the device send what was selected; raises DeviceError."""
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        """The answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
+        raise NotImplementedError
+
     # --- setting up
 
     def _prepare(self) -> None:
         wanted = self._wanted
-        self._stream.start()
-        self._early.clear()
-        self._ask("STO")
+        self._begin()
         self._identity = {"model": self._ask("VER").text or "CHRocodile"}
         intact = self._ever_set_up and self._selected()
         if wanted.head is not None:
             self._set("SEN", wanted.head)
-        self._set("SODX", *wanted.selection)
+        self._set("SODX", *self._selection)
         self._set_rate()
         for name, value in (
             ("LAI", wanted.lamp), ("AVD", wanted.averaging), ("THR", wanted.threshold),
@@ -173,16 +172,11 @@ class ChrocodileDevice(StreamDevice):
             if value is not None:
                 self._set(name, value)
         self._read_scale()
-        self._ask(FORMATS[wanted.format])
-        layout = self._layout()
-        self._check_line(layout)
         if not intact:
             self._ask(TRIGGERS[wanted.trigger])  # some of them start the counter anew
             self._tracker.begin_anew()
-        binary = wanted.format == "binary"
         self._ever_set_up = True
-        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
-        self._ask("STA")
+        self._finish()
         self._asked = self._monotonic()
 
     def _set(self, name: str, *values: float) -> None:
@@ -190,9 +184,7 @@ class ChrocodileDevice(StreamDevice):
         self._ask(name, *values)
         found = self._ask(name, QUERY).numbers
         self._identity[name] = " ".join(f"{number:g}" for number in found)
-        if found and not np.allclose(
-            found[: len(values)] + (np.nan,) * (len(values) - len(found)), values, rtol=1e-3
-        ):
+        if found and not _agree(found, values):
             raise DeviceError(
                 f"{self._transport.name}: ${name} was set to {values!r}, the device has {found!r}; "
                 "choose a value that it accepts"
@@ -206,7 +198,7 @@ class ChrocodileDevice(StreamDevice):
         if not found:
             return
         self._identity["SHZ"] = f"{found[0]:g}"
-        if free and abs(found[0] / rate - 1) > RATE_TOLERANCE:
+        if free and abs(found[0] / rate - 1) > RATE_TOLERANCE / 2:
             raise DeviceError(
                 f"{self._transport.name}: {rate:.6g} Hz was asked for, the device measures at "
                 f"{found[0]:.6g} Hz; set sample_period to {1 / found[0]:.9g} s"
@@ -223,61 +215,14 @@ class ChrocodileDevice(StreamDevice):
             self._probe = replace(self._wanted.probe, full_scale=found[0] * MICROMETRE_M)
             self._identity["SCA"] = f"{found[0]:g}"
 
-    def _layout(self) -> Layout:
-        """As the device describes its telegrams; as the table says where it does not."""
-        answer = self._ask("DTF")
-        try:
-            layout = Layout.described(answer.text, self._wanted.sync)
-        except ProtocolError:
-            layout = Layout.of(self._wanted.selection, self._wanted.sync)
-        if missing := set(self._wanted.selection) - set(layout.signals):
-            raise DeviceError(
-                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
-                f"sends {layout.signals!r} ($DTF {answer.text!r}); choose signals that it has"
-            )
-        self._signals = layout.signals
-        return layout
-
-    def _check_line(self, layout: Layout) -> None:
-        baud_rate = getattr(self._transport, "baud_rate", None)
-        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
-        if baud_rate is not None and needed > baud_rate:
-            raise DeviceError(
-                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
-                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
-            )
-
-    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
-        """The answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
-        wire = command(name, *arguments)
-        self._stream.expect(wire)
-        self._transport.write(wire)
-        deadline = self._monotonic() + (patience or self._wanted.patience)
-        while True:
-            self._early += self._stream.feed(self._transport.read(_READ_S))
-            answer = self._stream.take_answer()
-            if answer is not None:
-                return answer
-            if self._monotonic() > deadline:
-                raise self._unanswered(wire)
-
-    def _unanswered(self, wire: bytes) -> DeviceTimeoutError:
-        said = self._stream.last_outside
+    def _unanswered(self, name: str, said: bytes) -> DeviceTimeoutError:
         if said:
             hint = f"it sends {said[-32:]!r}: another baud rate, or no CHRocodile is there"
         else:
             hint = "check power, cable, and (on a serial line) the baud rate, 115200 by default"
-        asked = wire.decode().strip()
-        return DeviceTimeoutError(f"{self._transport.name} did not answer {asked!r}; {hint}")
+        return DeviceTimeoutError(f"{self._transport.name} did not answer {name!r}; {hint}")
 
     # --- reading
-
-    def _decode(self, data: bytes) -> Samples:
-        early, self._early = self._early, []
-        return self._samples(early + self._stream.feed(data))
-
-    def _rest(self) -> Samples:
-        return self._samples(self._stream.settle())
 
     def _listen_in(self, silent: float) -> None:
         """Ask a silent device whether it is still set up; a device that runs freely must talk."""
@@ -298,9 +243,9 @@ class ChrocodileDevice(StreamDevice):
     def _selected(self) -> bool:
         """Whether the device still has our selection; one that was restarted has its own."""
         found = self._ask("SODX", QUERY).numbers
-        return not found or found == tuple(map(float, self._wanted.selection))
+        return not found or found == tuple(map(float, self._selection))
 
-    def _samples(self, batches: Sequence[Records]) -> Samples:
+    def _converted(self, batches: Sequence[Records]) -> Samples:
         parts = [self._convert(records) for records in batches if len(records)]
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
@@ -311,24 +256,11 @@ class ChrocodileDevice(StreamDevice):
         samples["distance"], samples["intensity"], samples["status"] = found
         if self.channels.axes is not None:
             samples["counts"] = counts_of(records, self._wanted.latch, self._wanted.encoders)
-        if START_TIME in self._signals:
-            samples["time"] = self._unwrap(records[str(START_TIME)].astype(np.int64))
         if FLAGS in self._signals:
             flags = records[str(FLAGS)].astype(np.int64)
             self.triggers_lost += int(np.sum((flags & TRIGGER_LOST) > 0))
             self.triggers_delayed += int(np.sum((flags & TRIGGER_DELAYED) > 0))
         return samples
-
-    def _unwrap(self, raw: IntArray) -> IntArray:
-        """Device time [ns] that does not wrap: whole turns of a silence by the host's clock."""
-        now = self._monotonic()
-        previous = self._raw_time if self._raw_time is not None else int(raw[0])
-        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
-        hidden = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
-        steps[0] += max(0, round(hidden / _TIME_RANGE)) * _TIME_RANGE
-        times: IntArray = self._device_ns + np.cumsum(steps)
-        self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
-        return times
 
 
 def _agree(found: Sequence[float], wanted: Sequence[float]) -> bool:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, TypeAlias
 
-from omsm_ros.devices.chrocodile import ChrocodileDevice, ChrocodileSettings
+from omsm_ros.devices.chrocodile import ChrocodileSettings
+from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
+from omsm_ros.devices.chrocodile_packet import ChrocodilePacketDevice
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
@@ -96,7 +99,12 @@ def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamD
     return GenericStreamDevice(transport, settings, now_ns)
 
 
-def _chrocodile(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+def _chrocodile(
+    kind: type[ChrocodileDevice] | type[ChrocodilePacketDevice],
+    values: Values,
+    transport: Transport,
+    now_ns: NowNs,
+) -> StreamDevice:
     settings = ChrocodileSettings(
         **_blocks(values),
         signals=_numbers("signals", values["signals"]),
@@ -111,7 +119,7 @@ def _chrocodile(values: Values, transport: Transport, now_ns: NowNs) -> StreamDe
         head=_unless_negative(values["sensor_head"]),
         probe=_probe_reading(values),
     )
-    return ChrocodileDevice(transport, settings, now_ns)
+    return kind(transport, settings, now_ns)
 
 
 def _probe_reading(values: Values) -> ProbeReading:
@@ -140,5 +148,6 @@ def _unless_negative(value: Any) -> Any:
 
 DEVICES: dict[str, Callable[[Values, Transport, NowNs], StreamDevice]] = {
     "six_channel": _six_channel,
-    "chrocodile": _chrocodile,
+    "chrocodile": partial(_chrocodile, ChrocodileDevice),
+    "chrocodile_packet": partial(_chrocodile, ChrocodilePacketDevice),
 }

@@ -33,6 +33,11 @@ class Line(Protocol):
     def has_reader(self) -> bool:
         """Return whether anybody listens."""
 
+    @property
+    def sessions(self) -> int:
+        """Return how many clients have come so far."""
+        ...
+
     def read(self) -> bytes:
         """Return what the driver sent; b"" if nothing."""
 
@@ -112,6 +117,7 @@ class Instrument:
         self._unplugged = False
         self._kept, self._kept_since = b"", 0.0
         self._later: list[tuple[float, bytes]] = []
+        self._session = 0
         self.reset()
 
     # --- what a model fills in
@@ -126,6 +132,9 @@ class Instrument:
     def streaming(self) -> bool:
         """Whether samples are to be sent."""
         return True
+
+    def greet(self) -> None:
+        """Do what is done for a new client."""
 
     def receive(self, data: bytes) -> None:
         """Commands, in any portions."""
@@ -148,7 +157,12 @@ class Instrument:
         if now < self._quiet_until:
             self._measure(now)
             return
-        if data := self._line.read():
+        data = self._line.read()
+        if self._line.sessions != self._session:
+            self._session = self._line.sessions
+            self._later.clear()
+            self.greet()
+        if data:
             self.receive(data)
         self._send_answers(now, stop)
         self._send(self._measure(now), now, stop)

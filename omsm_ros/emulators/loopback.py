@@ -57,6 +57,7 @@ class Loopback:
         self.instrument: Stepping | None = None
         self._to_driver = self._to_device = b""
         self._plugged, self._open = True, False
+        self.sessions = 0
 
     # --- the instrument's side
 
@@ -96,6 +97,7 @@ class Loopback:
         if not self._plugged:
             raise DeviceError("cannot open 'loopback': unplugged")
         self._open = True
+        self.sessions += 1
         self._to_driver = self._to_device = b""
 
     def read(self, timeout: float) -> bytes:
@@ -142,6 +144,10 @@ class _DeviceEnd:
     @property
     def has_reader(self) -> bool:
         return self._loop.has_reader
+
+    @property
+    def sessions(self) -> int:
+        return self._loop.sessions
 
     def plug(self) -> None:
         self._loop.plug()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
+from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
 from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
 from omsm_ros.emulators.instrument import Instrument, Line
 from omsm_ros.emulators.pseudo_terminal import Pty
@@ -135,6 +136,11 @@ def _chrocodile(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(emulator)
 
 
+def _chrocodile_packet(line: Line, faults: Faults) -> Player:
+    emulator = ChrocodilePacketEmulator(line, triggered=True, seed=faults.seed, probe=_READING)
+    return InstrumentPlayer(emulator)
+
+
 _OWN_ENCODERS: dict[str, object] = {
     "encoders": "XYZUV",
     "trigger": "each",
@@ -147,6 +153,7 @@ _OWN_ENCODERS: dict[str, object] = {
 EMULATED = {
     "six_channel": Emulated(StreamPlayer, {}),
     "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
+    "chrocodile_packet": Emulated(_chrocodile_packet, _OWN_ENCODERS, tcp=True),
 }
 
 

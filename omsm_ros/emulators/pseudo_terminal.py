@@ -24,8 +24,12 @@ class Pty:
     open are lost, as on a real line. While a driver has it open but does not read, ``write``
     waits: nothing is lost, where a real UART would overrun.
 
+    Nothing tells when another driver opens it, so ``sessions`` stays 0.
+
     Not imitated: baud rate, parity, modem lines, breaks.
     """
+
+    sessions = 0
 
     def __init__(self, link: str | Path | None = None) -> None:
         """link: symbolic link to create, a name that stays the same; replaced if it exists."""

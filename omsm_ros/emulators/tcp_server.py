@@ -20,7 +20,8 @@ class TcpServer:
 
     A second client is turned away at once, as by a device with one connection; with
     ``newest_wins`` it takes the first one's place, as by others. Bytes written while nobody is
-    connected are lost. A client that does not read is waited for.
+    connected are lost. A client that does not read is waited for. ``sessions`` counts the
+    clients that were let in, ``turned_away`` the others.
 
     Not imitated: delay, loss and reordering of a network, keep-alive, several clients.
     """
@@ -31,7 +32,7 @@ class TcpServer:
         self._newest_wins = newest_wins
         self._listening: socket.socket | None = None
         self._client: socket.socket | None = None
-        self.turned_away = 0
+        self.turned_away = self.sessions = 0
 
     def __enter__(self) -> TcpServer:
         self.plug()
@@ -115,6 +116,7 @@ class TcpServer:
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._client = client
+            self.sessions += 1
 
     def _gone(self) -> bool:
         """Whether the client has closed its end."""

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.samples.blocks import Status
-from omsm_ros.devices.chrocodile import ChrocodileDevice, ChrocodileSettings
+from omsm_ros.devices.chrocodile import ChrocodileSettings
+from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
 from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
 from omsm_ros.emulators.instrument import Instrument
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.devices.chrocodile import ChrocodileDevice, ChrocodileSettings
+from omsm_ros.devices.chrocodile import ChrocodileSettings
+from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
 from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
 from omsm_ros.emulators.instrument import Instrument
 

@@ -1,0 +1,133 @@
+"""A CHRocodile in the dollar protocol, over a serial line or TCP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import IntArray
+from omsm_ros.devices.chrocodile import Chrocodile, ChrocodileSettings
+from omsm_ros.devices.counting import Samples
+from omsm_ros.devices.transport import Transport
+from omsm_ros.errors import DeviceError, ProtocolError
+from omsm_ros.protocols.chrocodile import Answer, DollarStream, command
+from omsm_ros.protocols.chrocodile_decoder import BinaryDecoder, LineDecoder
+from omsm_ros.protocols.chrocodile_telegram import (
+    DISTANCE,
+    FLAGS,
+    INTENSITY,
+    SAMPLE_COUNTER,
+    START_TIME,
+    Layout,
+    Records,
+)
+from omsm_ros.units import NANOSECONDS_PER_S
+
+FORMATS = {"binary": "BIN", "ascii": "ASC"}
+_TIME_RANGE = 2**32
+# Start bit, eight data bits, stop bit.
+_BITS_PER_BYTE = 10
+_READ_S = 0.05
+
+
+class ChrocodileDevice(Chrocodile):
+    """Reads telegrams, in the layout that the device describes."""
+
+    usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ChrocodileSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(transport, settings, now_ns, monotonic)
+        self._stream = DollarStream()
+        self._early: list[Records] = []
+        self._raw_time: int | None = None
+        self._device_ns = 0
+        self._time_at = 0.0
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        decoder = self._stream.decoder
+        return super().counts() | (asdict(decoder.statistics) if decoder is not None else {})
+
+    def _begin(self) -> None:
+        self._stream.start()
+        self._early.clear()
+        self._ask("STO")
+
+    def _finish(self) -> None:
+        self._ask(FORMATS[self._wanted.format])
+        layout = self._layout()
+        self._check_line(layout)
+        binary = self._wanted.format == "binary"
+        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
+        self._ask("STA")
+
+    def _layout(self) -> Layout:
+        """As the device describes its telegrams; as the table says where it does not."""
+        answer = self._ask("DTF")
+        try:
+            layout = Layout.described(answer.text, self._wanted.sync)
+        except ProtocolError:
+            layout = Layout.of(self._selection, self._wanted.sync)
+        if missing := set(self._selection) - set(layout.signals):
+            raise DeviceError(
+                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
+                f"sends {layout.signals!r} ($DTF {answer.text!r}); choose signals that it has"
+            )
+        self._signals = layout.signals
+        return layout
+
+    def _check_line(self, layout: Layout) -> None:
+        baud_rate = getattr(self._transport, "baud_rate", None)
+        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
+        if baud_rate is not None and needed > baud_rate:
+            raise DeviceError(
+                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
+                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
+            )
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        """The answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
+        wire = command(name, *arguments)
+        self._stream.expect(wire)
+        self._transport.write(wire)
+        deadline = self._monotonic() + (patience or self._wanted.patience)
+        while True:
+            self._early += self._stream.feed(self._transport.read(_READ_S))
+            answer = self._stream.take_answer()
+            if answer is not None:
+                return answer
+            if self._monotonic() > deadline:
+                raise self._unanswered(wire.decode().strip(), self._stream.last_outside)
+
+    def _decode(self, data: bytes) -> Samples:
+        early, self._early = self._early, []
+        return self._converted(early + self._stream.feed(data))
+
+    def _rest(self) -> Samples:
+        return self._converted(self._stream.settle())
+
+    def _convert(self, records: Records) -> Samples:
+        samples = super()._convert(records)
+        if START_TIME in self._signals:
+            samples["time"] = self._unwrap(records[str(START_TIME)].astype(np.int64))
+        return samples
+
+    def _unwrap(self, raw: IntArray) -> IntArray:
+        """Device time [ns] that does not wrap: whole turns of a silence by the host's clock."""
+        now = self._monotonic()
+        previous = self._raw_time if self._raw_time is not None else int(raw[0])
+        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
+        hidden = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
+        steps[0] += max(0, round(hidden / _TIME_RANGE)) * _TIME_RANGE
+        times: IntArray = self._device_ns + np.cumsum(steps)
+        self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
+        return times
