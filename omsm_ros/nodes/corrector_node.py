@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 
 from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.surface_points import pack_points
+from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.correction.uncertainty import ErrorSources, sources_with
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
@@ -71,7 +71,6 @@ class CorrectorNode(Node):
         self._refused = {"axes": 0, "distance": 0}
         self._complaint = ""
         self._load = LoadMeter()
-        self._stamp_ns = 0
         self._published = 0
         self._points = self.create_publisher(PointCloud2, "points", SAMPLES_QOS)
         if path:
@@ -163,7 +162,6 @@ class CorrectorNode(Node):
     # ----------------------------------------------------------------------- samples
 
     def _on_axes(self, message: AxisBlock, info: MessageInfo) -> None:
-        self._stamp_ns = conversions.stamp_of(message)
         self._take("axes", message, len(message.z), info)
 
     def _on_distance(self, message: DistanceBlock, info: MessageInfo) -> None:
@@ -189,11 +187,11 @@ class CorrectorNode(Node):
             self._publish(points)
             self._load.block(info["received_timestamp"], time.time_ns())
 
-    def _publish(self, points: object) -> None:
+    def _publish(self, points: SurfacePoints | None) -> None:
         if points is None or not self.context.ok():
             return
         cloud = conversions.cloud_message(
-            self._messages, pack_points(points), self._stamp_ns, self._frame
+            self._messages, pack_points(points), points.stamp_ns, self._frame
         )
         self._points.publish(cloud)
         self._published += 1

@@ -226,3 +226,8 @@ def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     expected = pack_points(join_points([part for part in parts if part is not None]))
     cell.wait("the clouds", lambda: sum(c.width for c in feed.clouds) >= len(expected))
     assert b"".join(bytes(cloud.data) for cloud in feed.clouds) == expected.tobytes()
+    # Each cloud carries the time of its own first point.
+    for cloud in feed.clouds:
+        first = np.frombuffer(bytes(cloud.data), expected.dtype)["sample"][0]
+        stamp = cloud.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == first * 1_000_000

@@ -228,6 +228,7 @@ class Corrector:
             dynamic_error=dynamic_error,
             uncertainty=self._uncertainty(reading, dynamics, timing),
             intensity=intensity.astype(np.float32),
+            stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
 
     def _uncertainty(

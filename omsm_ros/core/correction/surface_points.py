@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ class SurfacePoints:
     dynamic_error: (1 - G_m) X_d [m] (Eq. 5)
     uncertainty: standard uncertainty of height [m], k = 1
     intensity: 0-1, NaN where the device does not tell (float32)
+    stamp_ns: time of the first point [ns], by the axes' stamps; a number, 0 if there is none
     """
 
     sample: IntArray
@@ -30,29 +31,34 @@ class SurfacePoints:
     dynamic_error: FloatArray
     uncertainty: FloatArray
     intensity: NDArray[np.float32]
+    stamp_ns: int = 0
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def part(self, place: slice) -> SurfacePoints:
-        """The points at ``place``."""
-        return SurfacePoints(**{f.name: getattr(self, f.name)[place] for f in fields(self)})
+        """The points at ``place``, without a stamp."""
+        return SurfacePoints(**{name: getattr(self, name)[place] for name in _COLUMNS})
+
+
+_COLUMNS = ("sample", "x", "y", "height", "dynamic_error", "uncertainty", "intensity")
 
 
 def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
     """All points of ``parts`` in their order; None counts as no points."""
-    present = [part for part in parts if part is not None] or [_NO_POINTS]
-    return SurfacePoints(
-        **{
-            f.name: np.concatenate([getattr(p, f.name) for p in present])
-            for f in fields(_NO_POINTS)
-        }
-    )
+    present = [part for part in parts if part is not None and len(part)] or [_NO_POINTS]
+    columns = {name: np.concatenate([getattr(p, name) for p in present]) for name in _COLUMNS}
+    return SurfacePoints(**columns, stamp_ns=present[0].stamp_ns)
 
 
-_KINDS = {"sample": np.int64, "intensity": np.float32}
 _NO_POINTS = SurfacePoints(
-    **{f.name: np.empty(0, _KINDS.get(f.name, np.float64)) for f in fields(SurfacePoints)}
+    sample=np.empty(0, np.int64),
+    x=np.empty(0),
+    y=np.empty(0),
+    height=np.empty(0),
+    dynamic_error=np.empty(0),
+    uncertainty=np.empty(0),
+    intensity=np.empty(0, np.float32),
 )
 
 

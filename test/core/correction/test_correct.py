@@ -217,6 +217,31 @@ def test_single_samples_give_the_same_bits_as_one_block(scan: Recording) -> None
     assert single_account == account
 
 
+def test_points_carry_the_time_of_their_own_first_sample(scan: Recording) -> None:
+    late = 7_000_000_000
+    axes, distance = (
+        cut(shifted(part(whole, 0, 2000), 0, late / 1e9), range(100, 2000, 100))
+        for whole in (scan.axes, scan.distance)
+    )
+    corrector = Corrector(CALIBRATION)
+    for axis_block, _ in zip(axes, distance, strict=True):
+        corrector.push_axes(axis_block)  # type: ignore[arg-type]
+    for block in distance:
+        corrector.push_distance(block)  # type: ignore[arg-type]
+        points = corrector.take()
+        # Not that of the newest message, which is 2 s.
+        assert points is not None
+        assert points.stamp_ns == late + int(points.sample[0]) * 1_000_000
+
+
+def test_a_lost_first_sample_moves_the_time_on(scan: Recording) -> None:
+    distance = scan.distance.distance.copy()
+    distance[:500] = np.nan
+    points, _ = run([scan.axes], [replace(scan.distance, distance=distance)])
+    assert points.sample[0] == 500
+    assert points.stamp_ns == 500_000_000
+
+
 # --- every sample is accounted for ----------------------------------------------------------
 
 
