@@ -12,7 +12,6 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omsm_ros.core.correction.motion_filter import ABSURD, MotionFilter, MotionFilters
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
@@ -20,10 +19,10 @@ from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
-from omsm_ros.core.samples.accounts import Account, Reason, Tally
+from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
-from omsm_ros.core.samples.continuity import Arrival, TriggerCount
-from omsm_ros.core.samples.pairing import Pairing, Run
+from omsm_ros.core.samples.continuity import Arrival
+from omsm_ros.core.samples.pairing import Intake, Pairing, Run
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -86,9 +85,8 @@ class Corrector:
         self._static_gain = options.static_gain or calibration.static_gain
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
-        self._axes_tally, self._distance_tally = Tally(), Tally()
-        self._axes_count, self._distance_count = TriggerCount(), TriggerCount()
-        self._pairing = Pairing(self._axes_tally, self._distance_tally)
+        self._axes, self._distance = Intake(), Intake()
+        self._pairing = Pairing(self._axes.tally, self._distance.tally)
         self._motion: MotionFilter | None = None
         self._noise_gain = 1.0
         self._variance: defaultdict[str, float] = defaultdict(float)
@@ -101,9 +99,8 @@ class Corrector:
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
         motion = self._filter_for(block)
-        admission = _admit(self._axes_count, block, self._axes_tally)
-        if admission.skip < len(block):
-            for run in motion.push(_axes_run(block, admission)):
+        if (arrival := self._axes.new(block)) is not None:
+            for run in motion.push(_axes_run(block, arrival)):
                 self._pairing.axes.push(run)
             self._join()
             self._pairing.axes.limit(self._most_pending(block))
@@ -114,9 +111,8 @@ class Corrector:
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
         self._filter_for(block)
-        admission = _admit(self._distance_count, block, self._distance_tally)
-        if admission.skip < len(block):
-            self._pairing.distance.push(_distance_run(block, admission))
+        if (arrival := self._distance.new(block)) is not None:
+            self._pairing.distance.push(_distance_run(block, arrival))
             self._join()
             self._pairing.distance.limit(self._most_pending(block))
 
@@ -140,8 +136,8 @@ class Corrector:
         self._join()
         for queue in (self._pairing.axes, self._pairing.distance):
             queue.clear()
-        for sequence in (self._axes_count, self._distance_count):
-            sequence.end()
+        for intake in (self._axes, self._distance):
+            intake.end()
         return self.take()
 
     @property
@@ -149,8 +145,8 @@ class Corrector:
         """Where every sample received so far has gone."""
         warming = self._motion.pending if self._motion else 0
         return Account(
-            axes=self._axes_tally.snapshot(self._pairing.axes.pending + warming),
-            distance=self._distance_tally.snapshot(self._pairing.distance.pending),
+            axes=self._axes.tally.snapshot(self._pairing.axes.pending + warming),
+            distance=self._distance.tally.snapshot(self._pairing.distance.pending),
         )
 
     @property
@@ -164,7 +160,7 @@ class Corrector:
     @property
     def budget(self) -> dict[str, float]:
         """Standard uncertainty of the heights by its source [m], root mean square of all points."""
-        points = max(self._axes_tally.corrected, 1)
+        points = max(self._axes.tally.corrected, 1)
         return {name: float(np.sqrt(sum_ / points)) for name, sum_ in self._variance.items()}
 
     def _filter_for(self, block: Block) -> MotionFilter:
@@ -251,27 +247,13 @@ def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
     return max(calibration.dynamics.low_frequency_delay, 0.0) if stated else 0.0
 
 
-def _admit(sequence: TriggerCount, block: AxisBlock | DistanceBlock, tally: Tally) -> Arrival:
-    admission = sequence.place(block, len(block))
-    tally.received += len(block)
-    tally.count(Reason.LATE, admission.late)
-    tally.count(Reason.DUPLICATE, admission.skip - admission.late)
-    return admission
-
-
-def _axes_run(block: AxisBlock, admission: Arrival) -> Run:
+def _axes_run(block: AxisBlock, arrival: Arrival) -> Run:
     values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
-    return _run(block, admission, np.zeros(len(block), np.uint8), values)
+    return Run.of(block, arrival, np.zeros(len(block), np.uint8), values)
 
 
-def _distance_run(block: DistanceBlock, admission: Arrival) -> Run:
+def _distance_run(block: DistanceBlock, arrival: Arrival) -> Run:
     intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
     usable = block.ok & (abs(block.distance) < ABSURD)
     reasons = np.where(usable, Reason.NONE, Reason.INVALID).astype(np.uint8)
-    return _run(block, admission, reasons, np.array([block.distance, intensity], np.float64))
-
-
-def _run(block: Block, admission: Arrival, reasons: NDArray[np.uint8], values: FloatArray) -> Run:
-    period_ns = block.sample_period * NANOSECONDS_PER_S
-    whole = Run(admission.session, admission.first, block.stamp_ns, period_ns, reasons, values)
-    return whole.part(admission.skip, len(whole)) if admission.skip else whole
+    return Run.of(block, arrival, reasons, np.array([block.distance, intensity], np.float64))

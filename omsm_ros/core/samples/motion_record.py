@@ -1,25 +1,30 @@
 """One recording of an axis and of what the probe saw, on one regular grid.
 
-Blocks of one trigger are paired by its counter. Streams of different rates, or with a
-known offset between their clocks, are paired by their stamps on a grid that has every
-sample of the probe on it and is at least as fine as the axis's own sampling.
+Blocks of one trigger are paired by its counter. Where the rates differ there is no common
+trigger: then the axis is interpolated by the stamps, on a grid that has every sample of the
+probe on it and is at least as fine as the axis's own sampling.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from scipy import interpolate
 
-from omsm_ros.core.samples.blocks import AxisBlock, BoolArray, DistanceBlock, FloatArray, IntArray
+from omsm_ros.core.samples.accounts import Reason, StreamAccount, Tally
+from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
+from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
+from omsm_ros.core.samples.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
 from omsm_ros.errors import DataError
-from omsm_ros.units import NANOSECONDS_PER_S
 
 # Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
 MAX_RECORD_SAMPLES = 20_000_000
 _SAME_PERIOD = 1e-9
+
+B = TypeVar("B", bound=Block)
+Values: TypeAlias = Callable[[Any], "tuple[FloatArray, BoolArray]"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,15 +101,10 @@ def assemble(
     axes: Sequence[AxisBlock],
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock] = (),
-    *,
-    clock_offset: float = 0.0,
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
 
-    clock_offset: [s] to add to the probe's stamps to have the axis's clock; an unknown
-        offset cannot be told from a delay of the probe and is identified as one.
-
-    Raises DataError when nothing can be paired.
+    Raises DataError when nothing can be paired, or when it is more than one recording.
     """
     if not axes or not distance:
         raise DataError(
@@ -113,9 +113,9 @@ def assemble(
         )
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
-    if clock_offset == 0.0 and abs(probe_period / period - 1) < _SAME_PERIOD:
+    if abs(probe_period / period - 1) < _SAME_PERIOD:
         return _by_counter(axes, distance, reference, period)
-    return _by_stamp(axes, distance, reference, clock_offset)
+    return _by_stamp(axes, distance, reference)
 
 
 def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]) -> float:
@@ -127,46 +127,73 @@ def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]
     return periods[0]
 
 
+def _ordered(blocks: Iterable[B]) -> list[B]:
+    """As they were taken, not as they came."""
+    return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
+
+
+def _runs(blocks: Iterable[Block], values: Values, intake: Intake) -> Iterator[Run]:
+    """What is new of each block: ``values`` gives its channel (n,), and where it is usable."""
+    for block in _ordered(blocks):
+        if (arrival := intake.new(block)) is not None:
+            value, ok = values(block)
+            reasons = np.where(ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
+            yield Run.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
+
+
+def _position(block: Any) -> tuple[FloatArray, BoolArray]:
+    return block.z, np.isfinite(block.z)
+
+
+def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
+    return block.distance, block.ok
+
+
 @dataclass(frozen=True, eq=False)
-class _Stream:
-    """A channel by trigger counter: sorted, unique."""
+class _Grid:
+    """The axis on the counts ``first`` … of one session, (n,), NaN and not ``known`` in gaps."""
 
-    counter: IntArray
-    value: FloatArray
-    ok: BoolArray
-    duplicates: int
+    runs: list[Run]
+    first: int
+    z: FloatArray
+    known: BoolArray
+    account: StreamAccount
 
+    @classmethod
+    def of(cls, axes: Sequence[AxisBlock]) -> _Grid:
+        intake = Intake()
+        runs = list(_runs(axes, _position, intake))
+        sessions = len({run.session for run in runs})
+        first, samples = runs[0].first, runs[-1].end - runs[0].first
+        if sessions > 1 or samples > MAX_RECORD_SAMPLES:
+            raise DataError(
+                f"the recording spans {samples!r} samples in {sessions!r} runs of the trigger "
+                f"counter, expected one of at most {MAX_RECORD_SAMPLES}: two recordings in one, "
+                "a counter that was reset, or a clock set back; identify from one of them"
+            )
+        z, known = np.full(samples, np.nan), np.zeros(samples, np.bool_)
+        for run in runs:
+            place = slice(run.first - first, run.end - first)
+            z[place], known[place] = run.values[0], run.reasons == Reason.NONE
+        return cls(runs, first, z, known, intake.tally.snapshot(0))
 
-def _stream(parts: Iterable[tuple[int, FloatArray, BoolArray]]) -> _Stream:
-    counters, values, oks = [], [], []
-    for first, value, ok in parts:
-        counters.append(first + np.arange(len(value), dtype=np.int64))
-        values.append(np.asarray(value, np.float64))
-        oks.append(ok)
-    every = np.concatenate(counters)
-    unique, index = np.unique(every, return_index=True)
-    return _Stream(
-        unique,
-        np.concatenate(values)[index],
-        np.concatenate(oks)[index],
-        len(every) - len(unique),
-    )
-
-
-def _axis_stream(blocks: Sequence[AxisBlock]) -> _Stream:
-    return _stream((b.first_sample, b.z, np.isfinite(b.z)) for b in blocks)
-
-
-def _distance_stream(blocks: Sequence[DistanceBlock]) -> _Stream:
-    return _stream((b.first_sample, b.distance, b.ok) for b in blocks)
-
-
-def _check_span(samples: int) -> None:
-    if samples > MAX_RECORD_SAMPLES:
-        raise DataError(
-            f"the recording spans {samples!r} samples, more than {MAX_RECORD_SAMPLES}: "
-            "two recordings in one, or a counter that was reset"
-        )
+    def matched(
+        self, blocks: Sequence[DistanceBlock]
+    ) -> tuple[FloatArray, BoolArray, StreamAccount]:
+        """Readings on the grid (n,), where they are usable, and where all of them have gone."""
+        intake = Intake()
+        pairing = Pairing(Tally(), intake.tally)
+        for run in self.runs:
+            pairing.axes.push(run)
+        for run in _runs(blocks, _reading, intake):
+            pairing.distance.push(run)
+        seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
+        for axis, reading in pairing.pairs():
+            place = slice(axis.first - self.first, axis.end - self.first)
+            usable = reading.reasons == Reason.NONE
+            seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable
+        pairing.distance.clear()
+        return seen, ok, intake.tally.snapshot(0)
 
 
 def _by_counter(
@@ -175,50 +202,38 @@ def _by_counter(
     reference: Sequence[DistanceBlock],
     period: float,
 ) -> MotionRecord:
-    axis, probe = _axis_stream(axes), _distance_stream(distance)
-    first = int(axis.counter[0])
-    samples = int(axis.counter[-1]) - first + 1
-    _check_span(samples)
-    z, z_known = _on_grid(axis, first, samples)
-    seen, seen_ok = _on_grid(probe, first, samples)
-    present = np.isin(probe.counter, axis.counter, assume_unique=True)
-    if not np.any(present):
+    grid = _Grid.of(axes)
+    seen, ok, account = grid.matched(distance)
+    lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
+    if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
-            f"axis samples {first}…{axis.counter[-1]} and distance samples "
-            f"{probe.counter[0]}…{probe.counter[-1]} share no trigger count: "
-            "they are not of one recording"
+            f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
+            f"{distance[0].first_sample} share no trigger count at the same time: they are not of "
+            f"one recording, or their stamps differ by more than {STAMP_TOLERANCE_S} s"
         )
     return MotionRecord(
         sample_period=period,
-        z=_filled(z, z_known),
+        z=_filled(grid.z, grid.known),
         distance=seen,
-        ok=z_known & seen_ok,
-        reference=_on_grid(_distance_stream(reference), first, samples)[0] if reference else None,
-        z_lost=None if np.all(z_known) else ~z_known,
-        counts=_counts(axis, probe, int(np.sum(present)), int(np.sum(z_known & seen_ok)))
-        | {"missing_axis": samples - len(axis.counter)},
+        ok=grid.known & ok,
+        reference=grid.matched(reference)[0] if reference else None,
+        z_lost=None if np.all(grid.known) else ~grid.known,
+        counts=_counts(grid, account),
     )
 
 
-def _counts(axis: _Stream, probe: _Stream, paired: int, used: int) -> dict[str, int]:
+def _counts(grid: _Grid, probe: StreamAccount) -> dict[str, int]:
+    lost, axis_lost = probe.counted, grid.account.counted
+    on_grid = sum(len(run) for run in grid.runs)
     return {
-        "received": len(probe.counter) + probe.duplicates,
-        "duplicates": probe.duplicates,
-        "axis_duplicates": axis.duplicates,
-        "missing_axis": 0,
-        "unmatched": len(probe.counter) - paired,
-        "not_ok": paired - used,
-        "paired": used,
+        "received": probe.received,
+        "duplicates": lost.get("duplicate", 0) + lost.get("late", 0),
+        "axis_duplicates": axis_lost.get("duplicate", 0) + axis_lost.get("late", 0),
+        "missing_axis": len(grid.z) - on_grid,
+        "unmatched": lost.get("unmatched", 0),
+        "not_ok": lost.get("invalid", 0),
+        "paired": probe.corrected,
     }
-
-
-def _on_grid(stream: _Stream, first: int, samples: int) -> tuple[FloatArray, BoolArray]:
-    value, ok = np.full(samples, np.nan), np.zeros(samples, np.bool_)
-    place = stream.counter - first
-    inside = (place >= 0) & (place < samples)
-    value[place[inside]] = np.where(stream.ok, stream.value, np.nan)[inside]
-    ok[place[inside]] = stream.ok[inside]
-    return value, ok
 
 
 def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
@@ -228,59 +243,83 @@ def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
     return np.asarray(np.interp(index, index[known], z[known]))
 
 
-def _times(blocks: Sequence[AxisBlock] | Sequence[DistanceBlock], stream: _Stream) -> FloatArray:
-    """Seconds of each sample on the clock of the stamps: one line through all the blocks.
-
-    A stamp jitters with the computer that took it; the counter does not.
-    """
-    first = min(block.first_sample for block in blocks)
-    period = blocks[0].sample_period
-    offsets = [
-        block.stamp_ns / NANOSECONDS_PER_S - (block.first_sample - first) * period
-        for block in blocks
-    ]
-    return np.asarray(np.median(offsets) + (stream.counter - first) * period)
-
-
 def _by_stamp(
     axes: Sequence[AxisBlock],
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock],
-    clock_offset: float,
 ) -> MotionRecord:
-    axis, probe = _axis_stream(axes), _distance_stream(distance)
+    """Join by counter, once the axis is where a trigger of the grid would have latched it."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
-    axis_time = _times(axes, axis)[axis.ok]
-    probe_time = _times(distance, probe) + clock_offset
     finer = max(int(np.ceil(probe_period / axis_period - _SAME_PERIOD)), 1)
-    period = probe_period / finer
-    inside = (probe_time >= axis_time[0]) & (probe_time <= axis_time[-1]) if len(axis_time) else []
-    if not np.any(inside) or len(axis_time) < 4:
-        raise DataError(
-            f"{len(axis_time)} axis samples share no time with the distance stamps, clock offset "
-            f"{clock_offset!r} s: they are not of one recording"
-        )
-    place = (probe.counter - probe.counter[inside][0]) * finer
-    samples = int(place[inside][-1]) + 1
-    _check_span(samples)
-    grid = probe_time[inside][0] + np.arange(samples) * period
-    nearest = np.minimum(np.searchsorted(axis_time, grid), len(axis_time) - 1)
-    covered = axis_time[nearest] - axis_time[np.maximum(nearest - 1, 0)] < 1.5 * axis_period
-    seen, seen_ok = np.full(samples, np.nan), np.zeros(samples, np.bool_)
-    seen[place[inside]] = np.where(probe.ok, probe.value, np.nan)[inside]
-    seen_ok[place[inside]] = probe.ok[inside]
-    second = None
+    grid = [_refined(block, finer) for block in _ordered(distance)]
+    moved = axes_at_probe(_ordered(axes), grid)
+    second = []
     if reference:
-        other = _distance_stream(reference)
-        second = np.interp(
-            grid, (_times(reference, other) + clock_offset)[other.ok], other.value[other.ok]
-        )
-    return MotionRecord(
-        sample_period=period,
-        z=np.asarray(interpolate.CubicSpline(axis_time, axis.value[axis.ok])(grid)),
-        distance=seen,
-        ok=seen_ok & covered,
-        z_lost=None if np.all(covered) else ~covered,
-        reference=second,
-        counts=_counts(axis, probe, int(np.sum(inside)), int(np.sum(seen_ok & covered))),
+        carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
+        second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
+    record = _covered(_by_counter(moved, grid, second, probe_period / finer))
+    return replace(record, counts=_unfilled(record.counts, distance, finer))
+
+
+def _refined(block: DistanceBlock, finer: int) -> DistanceBlock:
+    """The block on a grid ``finer`` times as fine, its readings ``finer`` counts apart."""
+    values = np.full(len(block) * finer, np.nan)
+    values[::finer] = np.where(block.ok, block.distance, np.nan)
+    return DistanceBlock(
+        stamp_ns=block.stamp_ns,
+        first_sample=block.first_sample * finer,
+        sample_period=block.sample_period / finer,
+        distance=values,
     )
+
+
+def _as_axis(block: DistanceBlock) -> AxisBlock:
+    zero = np.zeros(len(block))
+    return AxisBlock(
+        stamp_ns=block.stamp_ns,
+        first_sample=block.first_sample,
+        sample_period=block.sample_period,
+        x=zero,
+        y=zero,
+        z=block.distance,
+        b=zero,
+        c=zero,
+    )
+
+
+def _covered(record: MotionRecord) -> MotionRecord:
+    """The record from the first to the last sample at which the axis is known.
+
+    Raises DataError if there is none.
+    """
+    known = np.ones(len(record), np.bool_) if record.z_lost is None else ~record.z_lost
+    places = np.flatnonzero(known)
+    if not len(places):
+        raise DataError(
+            "the axis samples share no time with the distance stamps: they are not of one "
+            "recording, or the clocks of their senders differ; set them"
+        )
+    part = slice(int(places[0]), int(places[-1]) + 1)
+    return replace(
+        record,
+        z=record.z[part],
+        distance=record.distance[part],
+        ok=record.ok[part],
+        reference=None if record.reference is None else record.reference[part],
+        z_lost=None if np.all(known[part]) else ~known[part],
+    )
+
+
+def _unfilled(
+    counts: Mapping[str, int], distance: Sequence[DistanceBlock], finer: int
+) -> dict[str, int]:
+    """The account of the readings themselves, without what lies between them on the grid."""
+    received = sum(map(len, distance))
+    duplicates, unmatched = (counts[name] // finer for name in ("duplicates", "unmatched"))
+    paired = counts["paired"]
+    return dict(counts) | {
+        "received": received,
+        "duplicates": duplicates,
+        "unmatched": unmatched,
+        "not_ok": received - duplicates - unmatched - paired,
+    }

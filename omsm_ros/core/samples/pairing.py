@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.samples.accounts import Reason, Tally
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import Block, FloatArray
+from omsm_ros.core.samples.continuity import Arrival, TriggerCount
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
@@ -41,6 +42,15 @@ class Run:
     period_ns: float
     reasons: NDArray[np.uint8]
     values: FloatArray
+
+    @classmethod
+    def of(
+        cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
+    ) -> Run:
+        """What is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
+        period_ns = block.sample_period * NANOSECONDS_PER_S
+        whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
+        return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
 
     def __len__(self) -> int:
         return len(self.reasons)
@@ -64,6 +74,26 @@ class Run:
             self.reasons[start:stop],
             self.values[:, start:stop],
         )
+
+
+class Intake:
+    """One stream's blocks on their way to a partner: what is new of each, what is counted."""
+
+    def __init__(self) -> None:
+        self.tally = Tally()
+        self._count = TriggerCount()
+
+    def new(self, block: Block) -> Arrival | None:
+        """Count the samples of ``block``; None if all were there before, or came too late."""
+        arrival = self._count.place(block, len(block))
+        self.tally.received += len(block)
+        self.tally.count(Reason.LATE, arrival.late)
+        self.tally.count(Reason.DUPLICATE, arrival.skip - arrival.late)
+        return arrival if arrival.skip < len(block) else None
+
+    def end(self) -> None:
+        """Whatever comes next begins a session."""
+        self._count.end()
 
 
 class Queue:

@@ -126,12 +126,72 @@ def test_streams_of_different_rates_meet_in_time(axis_period, probe_period):
     np.testing.assert_allclose(record.z[record.ok], -record.distance[record.ok], atol=1e-7)
 
 
-def test_a_known_clock_offset_is_taken_out():
+def motion(time):
+    return 1e-3 * np.sin(2 * np.pi * 20 * time)
+
+
+def cut_axis(rate, duration, size=50, stamp_s=0.0):
+    time = np.arange(round(duration * rate)) / rate
+    return [
+        axis_block(motion(time[k : k + size]), k, 1 / rate, stamp_s + k / rate)
+        for k in range(0, len(time), size)
+    ]
+
+
+def test_a_fast_axis_is_followed_between_its_samples():
+    # A cubic spline would be off by 2.6 nm here.
     time = np.arange(1000) * 1e-3
-    z = np.sin(2 * np.pi * 2 * time)
-    late = distance_block(-z, stamp_s=0.1)
-    record = assemble([axis_block(z)], [late], clock_offset=-0.1)
-    np.testing.assert_allclose(record.z[record.ok], -record.distance[record.ok], atol=1e-9)
+    probe = [distance_block(-motion(time[k : k + 100]), k) for k in range(0, 1000, 100)]
+    record = assemble(cut_axis(700.0, 1.1, stamp_s=-0.05), probe)
+    assert record.sample_period == 1e-3
+    readings = np.flatnonzero(record.ok)
+    shifted = motion(np.arange(len(record)) * 1e-3 + 0.05)
+    assert len(readings) > 900
+    # The axis's own time began 50 ms before the probe's.
+    assert np.max(abs(record.z[readings] - shifted[readings])) < 0.05e-9
+
+
+def test_every_reading_is_accounted_for_on_a_finer_grid_too():
+    axes = cut_axis(4000.0, 1.0)
+    del axes[20:30]
+    time = np.arange(1200) * 1e-3
+    reading = -motion(time)
+    reading[100] = np.nan
+    probe = [distance_block(reading[k : k + 100], k) for k in range(0, 1200, 100)]
+    record = assemble(axes, [*probe, probe[2]])
+    counts = record.counts
+    assert counts["received"] == 1300
+    assert counts["duplicates"] == 100
+    assert counts["paired"] == np.sum(record.ok)
+    told = counts["paired"] + counts["not_ok"] + counts["unmatched"] + counts["duplicates"]
+    assert told == counts["received"]
+    # A hole of 125 ms in the axis, 200 ms after its end, and the lost reading.
+    assert counts["paired"] == pytest.approx(1200 - 125 - 200 - 1, abs=3)
+    assert not np.any(record.ok[4 * 100])
+
+
+def test_a_reference_of_another_rate_is_carried_to_the_same_instants():
+    time = np.arange(1000) * 1e-3
+    probe = [distance_block(-motion(time), 0)]
+    fast = np.arange(4000) / 4000.0
+    reference = [distance_block(2 * motion(fast), period=1 / 4000)]
+    record = assemble(cut_axis(2000.0, 1.0), probe, reference)
+    seen = record.ok & np.isfinite(record.reference)
+    assert np.sum(seen) > 990
+    np.testing.assert_allclose(record.reference[seen], 2 * record.z[seen], rtol=0, atol=1e-9)
+
+
+def test_streams_of_other_times_and_rates_are_refused():
+    with pytest.raises(DataError, match="share no time"):
+        assemble(cut_axis(2000.0, 1.0), [distance_block(np.zeros(100), stamp_s=60.0)])
+
+
+@pytest.mark.parametrize("later_s", [30.0, 0.2])
+def test_two_recordings_in_one_are_refused(later_s):
+    axes, probe = blocks()
+    again = [axis_block(b.z, b.first_sample, stamp_s=later_s + b.first_sample * 1e-3) for b in axes]
+    with pytest.raises(DataError, match="2 runs of the trigger counter"):
+        assemble([*axes, *again], probe)
 
 
 def test_a_reference_comes_along_on_the_same_counts():
