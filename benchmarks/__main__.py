@@ -16,7 +16,7 @@ from pathlib import Path
 
 from benchmarks.row import Row
 
-PARTS = ("identification", "free_path", "correction", "offline", "live", "real_data")
+PARTS = ("identification", "free_path", "correction", "speed", "offline", "live", "real_data")
 
 
 def show(row: Row) -> None:

@@ -1,19 +1,14 @@
-"""How accurate, how honest and how fast is the correction?
-
-PyDynamic is the peer for propagating uncertainty through a recursive filter; it is optional,
-and needs NumPy below 2.4.
-"""
+"""How accurate and how honest is the correction?"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 from scipy import signal
 
-from benchmarks.row import Row, at_least, at_most, not_compared, shown
+from benchmarks.row import Row, at_most, shown
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
@@ -27,14 +22,13 @@ from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
-from omsm_ros.twin.cell import Cell, Recording, blocks_of, record
+from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, step_test_of
 from omsm_ros.units import MICROSECOND_S, NANOMETRE_M
 
-PAPER_POINTS = 290_011
 # The probe's noise and resolution, 10 nm each, at the scale of the surface.
 _FLOOR_M = float(np.hypot(10, 10 / np.sqrt(12))) * NANOMETRE_M / PAPER_STATIC_GAIN
 SOURCES = ErrorSources(
@@ -237,95 +231,6 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
     return covariance / np.outer(scale, scale)
 
 
-def _synthetic(samples: int) -> tuple[AxisBlock, DistanceBlock]:
-    """Six channels of the paper's kind of motion, without running the twin."""
-    time = np.arange(samples) * 1e-3
-    c = np.pi * time
-    z = 0.5e-3 * np.cos(c) + 0.05e-3 * np.cos(3 * c)
-    x, zero = np.linspace(14.5e-3, 0.0, samples), np.zeros(samples)
-    place = {"stamp_ns": 0, "first_sample": 0, "sample_period": 1e-3}
-    return (
-        AxisBlock(**place, x=x, y=zero, z=z, b=zero, c=c),  # type: ignore[arg-type]
-        DistanceBlock(**place, distance=1e-6 * np.sin(5 * c)),  # type: ignore[arg-type]
-    )
-
-
-def _seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """The quickest of some runs: what the work costs when nobody else wants the machine."""
-    times = []
-    for _ in range(repeats):
-        begin = perf_counter()
-        work()
-        times.append(perf_counter() - begin)
-    return min(times)
-
-
-def speed() -> list[Row]:
-    """A whole scan at once, ten times as much, live blocks, and the peer."""
-    calibration = identified_calibration()
-    one, ten = _synthetic(PAPER_POINTS), _synthetic(10 * 80_000)
-    tenth = _synthetic(80_000)
-    whole = _seconds(lambda: corrected(calibration, *one))
-    factor = _seconds(lambda: corrected(calibration, *ten), 3) / _seconds(
-        lambda: corrected(calibration, *tenth)
-    )
-    peer = _peer_seconds_per_sample(calibration, one[0].z)
-    rows = [
-        at_most("290 011 samples x 6 with uncertainty", whole, "s", 0.3),
-        at_most("ten times the samples, time factor", factor, "1", 11.0),
-        at_most("one live pair of blocks of 100", 1e3 * _live_seconds(calibration), "ms", 0.5),
-    ]
-    name = "times as fast as PyDynamic's IIRuncFilter"
-    if peer is None:
-        rows.append(not_compared(name, "1", ">= 25", "needs PyDynamic and NumPy below 2.4"))
-    else:
-        rows.append(at_least(name, peer * PAPER_POINTS / whole, "1", 25.0, "PyDynamic"))
-    return rows
-
-
-def _live_seconds(calibration: Calibration) -> float:
-    axes, distance = _synthetic(20_000)
-    truth = np.zeros(len(axes))
-    made = Recording(axes=axes, distance=distance, probe_motion=truth, surface_height=truth)
-    pairs = blocks_of(
-        replace(
-            made,
-            distance=replace(
-                distance,
-                intensity=np.ones(len(axes), np.float32),
-                status=np.zeros(len(axes), np.uint8),
-            ),
-        )
-    )
-
-    corrector = Corrector(calibration, CorrectionOptions(sources=SOURCES))
-
-    def live() -> None:
-        for a, d in pairs:
-            corrector.push_axes(a)
-            corrector.push_distance(d)
-            corrector.take()
-        corrector.finish()
-
-    # The first run also designs the filters, which happens once.
-    return _seconds(live, 4) / len(pairs)
-
-
-def _peer_seconds_per_sample(calibration: Calibration, z: np.ndarray) -> float | None:
-    """PyDynamic's filter with coefficient covariance, on a part of the same path [s]."""
-    try:
-        from PyDynamic.uncertainty.propagate_filter import IIRuncFilter
-    except ImportError:
-        return None
-    if np.lib.NumpyVersion(np.__version__) >= "2.4.0":
-        # PyDynamic 2.5.1 writes arrays of one element into scalars, which NumPy 2.4 refuses.
-        return None
-    b, a = signal.sos2tf(discretise(calibration.dynamics, 1e-3).sections)
-    used = z[:8000]
-    coefficients = np.diag((1e-6 * np.r_[a[1:], b]) ** 2)
-    return _seconds(lambda: IIRuncFilter(used, 4e-10, b, a, coefficients), 2) / len(used)
-
-
 def lateral_lag() -> list[Row]:
     """A probe 0.34 ms late, found by turning the spindle the other way."""
     latency = 0.34e-3
@@ -365,7 +270,6 @@ STUDIES: tuple[Callable[[], list[Row]], ...] = (
     honesty,
     honesty_of_the_chain,
     lateral_lag,
-    speed,
 )
 
 

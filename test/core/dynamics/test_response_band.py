@@ -228,3 +228,39 @@ def test_a_pure_delay_is_as_uncertain_as_it_is_stated():
     covariance = np.diag([0.0, 4e-12])
     pure = TransferFunction([1.0], [1.0], 1e-4)
     assert low_frequency_delay_uncertainty(pure, covariance) == pytest.approx(2e-6)
+
+
+def test_either_limit_alone_costs_about_the_same():
+    """A phase off by φ misses as much of a motion as a gain off by φ."""
+    limits = ResponseLimits()
+    missed_by_phase = abs(np.exp(1j * limits.phase) - 1)
+    assert 0.5 < missed_by_phase / limits.gain < 2
+
+
+def test_a_known_disagreement_of_the_phase_alone_narrows_the_trust():
+    lines = np.array([1.0, 10.0, 100.0])
+    limits, quiet = ResponseLimits(gain=0.01, phase=0.02), np.zeros(3)
+    band = Band(lines, quiet, np.full(3, 0.009))
+    assert trusted_up_to(band, limits) == 100.0
+    other = Band(lines, quiet, np.array([0.0, 0.001, 0.01]))
+    assert trusted_up_to(band, limits, other) == 10.0
+    assert trusted_up_to(band, limits, Band(lines, quiet, np.full(3, 0.01))) == 0.0
+
+
+def test_uncertainty_of_the_low_frequency_delay_with_a_gain_at_rest():
+    """Of a numerator that does not begin with 1: by finite differences."""
+    g = TransferFunction([2.0, -3e-3], [1.0, 5e-3], 1e-3)
+    values = np.array([2.0, -3e-3, 5e-3, 1e-3])
+
+    def delay(v):
+        return TransferFunction(v[:2], [1.0, v[2]], v[3]).low_frequency_delay
+
+    gradient = []
+    for k in range(4):
+        step = np.zeros(4)
+        step[k] = 1e-6 * abs(values[k])
+        gradient.append((delay(values + step) - delay(values - step)) / (2 * step[k]))
+    mixing = np.random.default_rng(3).normal(size=(4, 4)) * np.abs(values)[:, np.newaxis] * 1e-3
+    covariance = mixing @ mixing.T
+    expected = np.sqrt(np.array(gradient) @ covariance @ np.array(gradient))
+    assert low_frequency_delay_uncertainty(g, covariance) == pytest.approx(expected, rel=1e-6)

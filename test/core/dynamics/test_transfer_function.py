@@ -35,6 +35,22 @@ def test_mode_of_a_resonator():
     assert TWO_POLES.low_frequency_delay == pytest.approx(2 * 0.1 / 300)
 
 
+@pytest.mark.parametrize("scale", [1.0, -0.7])
+def test_the_low_frequency_delay_is_the_slope_of_the_phase(scale):
+    """With a zero, a pole and a delay, whatever the gain."""
+    g = TransferFunction([scale, -2e-3 * scale], [1.0, 5e-3, 1e-6], 1e-3)
+    frequency, gain = 1e-4, g.response([1e-4])[0] / g.dc_gain
+    slope = -np.angle(gain) / (2 * np.pi * frequency)
+    assert g.low_frequency_delay == pytest.approx(slope, rel=1e-6)
+    assert g.low_frequency_delay == pytest.approx(8e-3)
+
+
+def test_a_pole_on_or_beyond_the_border_is_not_stable():
+    assert not TransferFunction([1.0], [1.0, -2.0]).is_stable  # at 0.5 rad/s
+    resonator = TransferFunction.from_ascending([1.0], [1.0, 0.0, 1e-4])
+    assert not resonator.is_stable
+
+
 def test_stability_is_that_of_the_poles():
     assert TWO_POLES.is_stable
     assert not TransferFunction([1.0], [1.0, -0.1]).is_stable
