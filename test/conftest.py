@@ -1,4 +1,8 @@
-"""Recordings of the twin that several tests look at; made once, never changed."""
+"""Recordings of the twin that several tests look at; made once, never changed.
+
+And who runs what when several processes share the tests: a file stays together, for its tests
+share recordings; all that start nodes stay together, for they share the machine's patience.
+"""
 
 import pytest
 
@@ -9,6 +13,13 @@ from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
 # A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000.
 SMALL = Scenario(start_radius=2e-3)
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        folder = item.path.parent.name
+        group = folder if folder == "system" else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="session")
