@@ -16,7 +16,10 @@ from pathlib import Path
 
 from benchmarks.row import Row
 
-PARTS = ("identification", "free_path", "correction", "speed", "offline", "live", "real_data")
+PARTS = (
+    *("identification", "free_path", "correction", "speed", "offline", "live", "real_data"),
+    "twin",
+)
 
 
 def show(row: Row) -> None:

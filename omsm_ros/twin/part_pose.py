@@ -11,9 +11,9 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.twin.record_checks import check_numbers, is_default
 
 # Each turn of the iteration leaves tilt times slope, at most a hundredth, of the error before;
-# it ends when nothing changes beyond rounding of a millimetre [m].
+# it ends when what is left is beyond rounding of a millimetre [m].
 _MOST_ITERATIONS = 8
-_SETTLED_M = 1e-16
+_SETTLED_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class PosedSurface:
         """Height [m] at x, y [m] of the chuck, of their broadcast shape."""
         pose, turn = self.pose, self.pose.rotation
         across, along = np.asarray(x) - pose.x_m, np.asarray(y) - pose.y_m
-        z = self.surface.height(across, along)
+        z = np.zeros(np.broadcast(across, along).shape)
         for _ in range(_MOST_ITERATIONS):
             # In the part's frame: p = Rᵀ (q - shift).
             px, py, pz = (

@@ -27,9 +27,9 @@ Random = Mapping[str, np.random.Generator]
 # Sample periods simulated beyond those asked for, so that a cubic has its four points.
 _SPARE_SAMPLES = 3
 # Each turn of the search for a slanting beam's end leaves slope times slant of the error before;
-# it ends when nothing changes by more than this [m].
+# it ends when the last one changed no more than this [m].
 _MOST_BEAM_ITERATIONS = 12
-_BEAM_SETTLED_M = 1e-14
+_BEAM_SETTLED_M = 1e-12
 
 
 class Look(NamedTuple):
@@ -89,8 +89,8 @@ class Scene:
             return slides
         return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
 
-    def look(self, time: FloatArray) -> Look:
-        """What is before the probe at ``time`` (n,) [s]."""
+    def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> Look:
+        """What is before the probe at ``time`` (n,) [s], ``about`` so far away [m]."""
         slides = self.positions(time)
         x, y, raised = self._shift(time, slides)
         shifted = slides._replace(x=slides.x - x, y=slides.y - y)
@@ -100,7 +100,7 @@ class Scene:
             height = self.surface.height(on_x, on_y)
             distance = height + raised - probe - self.stand_off
             return Look(probe, height, on_x, on_y, distance)
-        return self._along_the_beam(mount, shifted, probe, raised)
+        return self._along_the_beam(mount, shifted, probe, raised, about)
 
     def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
         """Of the workpiece against the probe, all in all."""
@@ -111,11 +111,16 @@ class Scene:
         return total
 
     def _along_the_beam(
-        self, mount: Geometry, slides: AxisPositions, probe: FloatArray, raised: FloatArray
+        self,
+        mount: Geometry,
+        slides: AxisPositions,
+        probe: FloatArray,
+        raised: FloatArray,
+        about: FloatArray | float,
     ) -> Look:
         """As ``look``, for a beam that slants or a probe that B carries about."""
         zero = probe + self.stand_off - raised
-        distance = np.zeros_like(probe)
+        distance = np.zeros_like(probe) + about
         for _ in range(_MOST_BEAM_ITERATIONS):
             at = workpiece_points(mount, (slides.x, slides.y, zero), slides.b, slides.c, distance)
             height = self.surface.height(at.x, at.y)
@@ -131,7 +136,7 @@ class Scene:
         before, weights = probe.looks()
         look = self.look(time - before[0])
         if len(before) > 1:
-            looks = (look, *(self.look(time - ago) for ago in before[1:]))
+            looks = (look, *(self.look(time - ago, look.distance) for ago in before[1:]))
             look = Look(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
         if not self.vibration.lines:
             return look
