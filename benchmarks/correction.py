@@ -21,7 +21,8 @@ from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.verification.reversal import ScanPath, sideways_lag
+from omsm_ros.core.verification.reversal import sideways_lag
+from omsm_ros.core.verification.scan_reader import read_scan
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
@@ -246,7 +247,7 @@ def lateral_lag() -> list[Row]:
     for speed, seed in ((30.0, 1), (-30.0, 2)):
         made = scan(speed, seed, cell)
         points = corrected(calibration, made.axes, made.distance, lateral_lag=0.0)
-        scans.append(ScanPath.of(points, 1e-3))
+        scans.append(read_scan(made.axes, points))
     found = sideways_lag(scans, calibration)
     error = abs(found.lag - latency)
     put_right = corrected(calibration, made.axes, made.distance, lateral_lag=found.lag)

@@ -1,4 +1,4 @@
-"""Commands that find out how the probe sits: reversal, align."""
+"""The command that finds out how the probe sits: align."""
 
 from __future__ import annotations
 
@@ -10,47 +10,10 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
-from omsm_ros.jobs.study_scans import alignment_of, sideways_lag_of
+from omsm_ros.jobs.study_scans import alignment_of
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.machine_files import save_geometry
-from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
-
-# ------------------------------------------------------------------------------ reversal
-
-
-def _declare_reversal(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
-    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
-    sub.add_argument("--calibration", **CALIBRATION)
-
-
-def _reversal(args: argparse.Namespace) -> Facts:
-    calibration = load_calibration(args.calibration)
-    with progress_bar("correcting", args.json) as progress:
-        bags = (args.clockwise, args.counterclockwise)
-        found, accounts = sideways_lag_of(bags, calibration, progress)
-    return asdict(found) | {"samples": [account.as_dict() for account in accounts]}
-
-
-_MEANINGS = {
-    True: "the probe is late: X and C must be delayed too (setting lag_is_latency)",
-    False: "the lag is mechanical, in Z only",
-    None: "neither none nor all of the lag of Z; give it with --lateral-lag",
-}
-
-
-def _show_reversal(facts: Facts) -> None:
-    table(
-        [
-            ("sideways lag", f"{facts['lag'] / MICROSECOND_S:.2f} µs "
-                             f"± {facts['uncertainty'] / MICROSECOND_S:.2f} µs (k = 1)"),
-            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
-            ("meaning", _MEANINGS[facts["latency"]]),
-            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
-            ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
-        ]
-    )  # fmt: skip
-
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # --------------------------------------------------------------------------------- align
 
@@ -101,13 +64,6 @@ def _show_align(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command(
-        "reversal",
-        "is the lag latency? From two scans with opposite spindle directions",
-        _declare_reversal,
-        _reversal,
-        _show_reversal,
-    ),
     Command(
         "align",
         "spindle centre and beam direction from a scan of a reference sphere",

@@ -1,8 +1,9 @@
-"""What is learnt from whole scans: the lateral delay, and how the probe sits."""
+"""What is learnt from whole scans: dynamics and latency, and how the probe sits."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from omsm_ros.core.correction.correct import CorrectionOptions
@@ -11,10 +12,26 @@ from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.samples.accounts import Account
 from omsm_ros.core.samples.blocks import AxisBlock
 from omsm_ros.core.surface.alignment import Alignment, SphereScanReader, align_on_sphere
-from omsm_ros.core.verification.reversal import ScanPath, SidewaysLag, sideways_lag
+from omsm_ros.core.verification.resolved_calibration import (
+    after_step_test,
+    from_scans_alone,
+    resolved,
+    unit_calibration,
+    without_step_test,
+)
+from omsm_ros.core.verification.reversal import SidewaysLag, sideways_lag
+from omsm_ros.core.verification.scan_reader import ScanColumns, ScanReader
+from omsm_ros.core.verification.self_calibration import (
+    DEFAULT_CLOCKING_RAD,
+    DEFAULT_HARMONICS,
+    WIDE_GAIN,
+    SelfCalibration,
+    self_calibrate,
+)
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.corrected_scan import CorrectedScan
 from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.storage import bags
 
 # What is to be found must not be in the points already.
 _PLAIN = CorrectionOptions(lateral_lag=0.0)
@@ -27,17 +44,77 @@ def sideways_lag_of(
 
     Also return where every sample of each scan has gone.
     """
-    paths, accounts = [], []
+    scans, accounts = _read_scans(bag_paths, calibration, _PLAIN, progress)
+    return sideways_lag(scans, calibration), accounts
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCalibrationOptions:
+    """How to calibrate on the part itself.
+
+    harmonics: highest of the surface in a turn
+    clocking: standard uncertainty of C from scan to scan [rad], inf if the part was re-mounted
+    polarity, static_gain, gain_uncertainty, settings: of the probe, without a step test to tell
+        them; the uncertainty is a share of the gain
+    """
+
+    harmonics: int = DEFAULT_HARMONICS
+    clocking: float = DEFAULT_CLOCKING_RAD
+    polarity: int = 1
+    static_gain: float = 1.0
+    gain_uncertainty: float = WIDE_GAIN
+    settings: Mapping[str, object] = field(default_factory=dict)
+
+
+def self_calibration_of(
+    bag_paths: Sequence[Path],
+    step_test: Calibration | None,
+    options: SelfCalibrationOptions,
+    progress: Progress = no_progress,
+) -> tuple[SelfCalibration, Calibration, list[Account]]:
+    """What scans of one part tell of the dynamics, and a calibration from it.
+
+    step_test: from the same machine; None takes the scans alone
+    Also return where every sample of each scan has gone.
+    """
+    period = _sample_period_of(bag_paths[0])
+    base = step_test or unit_calibration(period, options.static_gain)
+    prior = after_step_test(base) if step_test else without_step_test(options.gain_uncertainty)
+    plain = replace(_PLAIN, polarity=options.polarity)
+    scans, accounts = _read_scans(bag_paths, base, plain, progress)
+    found = self_calibrate(scans, replace(prior, clocking=options.clocking), options.harmonics)
+    if step_test:
+        return found, resolved(step_test, found), accounts
+    alone = from_scans_alone(found, period, options.static_gain, options.settings)
+    return found, alone, accounts
+
+
+def _sample_period_of(path: Path) -> float:
+    with bags.BagReader(path) as bag:
+        for _, block in bag.records(bags.DISTANCE_TOPIC):
+            return float(block.sample_period)
+    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
+
+
+def _read_scans(
+    bag_paths: Sequence[Path],
+    calibration: Calibration,
+    options: CorrectionOptions,
+    progress: Progress,
+) -> tuple[list[ScanColumns], list[Account]]:
+    scans, accounts = [], []
     for bag in bag_paths:
-        with CorrectedScan(bag, calibration, _PLAIN, progress=progress) as scan:
-            path = ScanPath(scan.sample_period)
-            for _, points in scan.steps():
+        with CorrectedScan(bag, calibration, options, progress=progress) as scan:
+            reader = ScanReader(scan.sample_period)
+            for block, points in scan.steps():
+                if isinstance(block, AxisBlock):
+                    reader.add_axes(block)
                 if points is not None:
-                    path.add(points)
+                    reader.add(points)
             _check_points(scan)
-            paths.append(path)
+            scans.append(reader.columns())
             accounts.append(scan.account)
-    return sideways_lag(paths, calibration), accounts
+    return scans, accounts
 
 
 def alignment_of(

@@ -158,8 +158,8 @@ def test_reversal_finds_no_latency_in_a_mechanical_lag(capsys, tmp_path, calibra
     assert found["uncertainty"] < 50e-6
     assert found["latency"] is False
     assert found["points"] == sum(s["axes"]["corrected"] for s in found["samples"]) > 59_900
-    assert found["used"] == 60_000 - sum(2 + s["axes"]["received"] - s["axes"]["corrected"]
-                                         for s in found["samples"])  # fmt: skip
+    # Those at the ends have no neighbours, those near the axis no place on the part.
+    assert 0.98 * found["points"] < found["used"] < found["points"]
     assert all(s["axes"]["received"] == 30_000 for s in found["samples"])
 
 

@@ -1,0 +1,225 @@
+"""Commands that divide a lag into structure and latency: selfcal, reversal, latency."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
+from omsm_ros.cli.measuring import CALIBRATION
+from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
+from omsm_ros.core.verification.resolved_calibration import untold
+from omsm_ros.core.verification.self_calibration import (
+    DEFAULT_CLOCKING_RAD,
+    DEFAULT_HARMONICS,
+    WIDE_GAIN,
+)
+from omsm_ros.jobs.study_scans import (
+    SelfCalibrationOptions,
+    self_calibration_of,
+    sideways_lag_of,
+)
+from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.units import MICROSECOND_S, NANOMETRE_M, RPM_RAD_S
+
+# ------------------------------------------------------------------------------- selfcal
+
+
+def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("scans", type=Path, nargs="+", metavar="SCAN", help="two or more of one part")
+    sub.add_argument("--calibration", type=Path, metavar="STEP.json", help="from a step test")
+    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+    sub.add_argument(
+        "--harmonics", type=int, default=DEFAULT_HARMONICS, help="highest of the surface in a turn"
+    )
+    sub.add_argument(
+        "--clocking",
+        type=float,
+        default=DEFAULT_CLOCKING_RAD,
+        help="standard uncertainty of C between the scans [rad]; inf if the part was re-mounted",
+    )
+    sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
+    sub.add_argument(
+        "--static-gain", type=positive, default=1.0, help="of the probe, without a step test"
+    )
+    sub.add_argument(
+        "--gain-uncertainty", type=positive, default=WIDE_GAIN, help="standard, as a share of it"
+    )
+    sub.add_argument(
+        "--settings", type=json_object, default={}, metavar="JSON", help="without a step test"
+    )
+
+
+def _selfcal(args: argparse.Namespace) -> Facts:
+    step_test = load_calibration(args.calibration) if args.calibration else None
+    options = SelfCalibrationOptions(
+        harmonics=args.harmonics,
+        clocking=args.clocking,
+        polarity=args.polarity,
+        static_gain=args.static_gain,
+        gain_uncertainty=args.gain_uncertainty,
+        settings=args.settings,
+    )
+    with progress_bar("reading", args.json) as progress:
+        found, made, accounts = self_calibration_of(args.scans, step_test, options, progress)
+    save_calibration(args.out, made)
+    return {
+        **_resolved_facts(made),
+        "residual": found.residual,
+        "left_on_this_surface": found.followed,
+        "disagreement": found.agreement.disagreement,
+        "not_told": untold(found),
+        "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
+        "samples": [account.as_dict() for account in accounts],
+        "calibration": str(args.out),
+    }
+
+
+def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
+    verdict, reasons = verdict_of(calibration)
+    spread = calibration.certificate.get("low_frequency_delay_uncertainty_s")
+    return {
+        "id": calibration.id,
+        "verdict": verdict,
+        "reasons": reasons,
+        "lag": calibration.dynamics.low_frequency_delay,
+        "lag_uncertainty": spread,
+        "latency": latency_of(calibration).entry(),
+        "valid_up_to": calibration.valid_up_to,
+    }
+
+
+def _show_selfcal(facts: Facts) -> None:
+    table(
+        [
+            ("verdict", facts["verdict"]),
+            *(("reason", text) for text in facts["reasons"]),
+            ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
+            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            *_latency_rows(facts["latency"]),
+            ("valid up to", f"{facts['valid_up_to']:.1f} Hz"),
+            ("left on this surface", f"{facts['left_on_this_surface'] / NANOMETRE_M:.2f} nm "
+                                     "rms (k = 1)"),
+            ("scans differ by", f"{facts['disagreement'] / NANOMETRE_M:.2f} nm rms beyond noise"),
+            *(("not told", text) for text in facts["not_told"]),
+            ("written to", facts["calibration"]),
+        ]
+    )  # fmt: skip
+
+
+def _time(seconds: float, spread: float | None) -> str:
+    known = "unknown" if spread is None else f"{spread / MICROSECOND_S:.2f} µs (k = 1)"
+    return f"{seconds / MICROSECOND_S:.2f} µs ± {known}"
+
+
+def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
+    share = latency["share"]
+    return [
+        ("of it latency", _time(latency["delay_s"], latency["uncertainty_s"])),
+        ("share", "not known" if share is None else f"{share:.3f}"),
+        ("by", f"{latency['source']}: {latency['reason']}"),
+    ]
+
+
+# ------------------------------------------------------------------------------ reversal
+
+
+def _declare_reversal(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
+    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument("--out", type=Path, metavar="CAL.json", help="with the latency in it")
+
+
+def _reversal(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("correcting", args.json) as progress:
+        bags = (args.clockwise, args.counterclockwise)
+        found, accounts = sideways_lag_of(bags, calibration, progress)
+    facts = {
+        name: getattr(found, name)
+        for name in ("lag", "uncertainty", "lag_of_z", "residual", "used", "latency")
+    }
+    facts["points"] = sum(account.axes.corrected for account in accounts)
+    facts["samples"] = [account.as_dict() for account in accounts]
+    if args.out:
+        save_calibration(args.out, found.calibration)
+        facts["calibration"] = str(args.out)
+    return facts
+
+
+_MEANINGS = {
+    True: "the probe is late: X and C must be delayed too",
+    False: "the lag is mechanical, in Z only",
+    None: "neither none nor all of the lag of Z",
+}
+
+
+def _show_reversal(facts: Facts) -> None:
+    table(
+        [
+            ("sideways lag", _time(facts["lag"], facts["uncertainty"])),
+            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
+            ("meaning", _MEANINGS[facts["latency"]]),
+            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
+            ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
+            ("written to", facts.get("calibration", "nowhere; give --out to use it")),
+        ]
+    )
+
+
+# ------------------------------------------------------------------------------- latency
+
+
+def _declare_latency(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("calibration", type=Path, metavar="CAL.json")
+    sub.add_argument("--delay", type=float, required=True, help="of the probe [s]; 0 for none")
+    sub.add_argument("--uncertainty", type=float, required=True, help="standard, k = 1 [s]")
+    sub.add_argument("--reason", required=True, help="where the figure comes from")
+    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+
+
+def _latency(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    lag = calibration.dynamics.low_frequency_delay
+    latency = declared(lag, args.delay, args.uncertainty, args.reason)
+    made = with_latency(calibration, latency)
+    save_calibration(args.out, made)
+    return {**_resolved_facts(made), "calibration": str(args.out)}
+
+
+def _show_latency(facts: Facts) -> None:
+    table(
+        [
+            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            *_latency_rows(facts["latency"]),
+            ("written to", facts["calibration"]),
+        ]
+    )
+
+
+COMMANDS = (
+    Command(
+        "selfcal",
+        "dynamics from two or more scans of one part at different speeds or directions",
+        _declare_selfcal,
+        _selfcal,
+        _show_selfcal,
+    ),
+    Command(
+        "reversal",
+        "is the lag latency? From two scans with opposite spindle directions",
+        _declare_reversal,
+        _reversal,
+        _show_reversal,
+    ),
+    Command(
+        "latency",
+        "declare how much of a calibration's lag is latency, with a reason",
+        _declare_latency,
+        _latency,
+        _show_latency,
+    ),
+)

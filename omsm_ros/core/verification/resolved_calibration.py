@@ -1,0 +1,277 @@
+"""A calibration from what scans of one part tell, with or without a step test before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+import numpy as np
+from scipy import stats
+
+from omsm_ros.core.dynamics.calibration import REJECTED, Calibration
+from omsm_ros.core.dynamics.latency import ENTRY, REVERSAL, SPEEDS, Latency, share_of
+from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
+from omsm_ros.core.dynamics.slow_motion import slow_motion_jacobian
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.verification.scan_model import CURVATURE, DYNAMIC, GAIN, LAG, LATENCY, OWN
+from omsm_ros.core.verification.self_calibration import (
+    WIDE_CURVATURE_S2,
+    WIDE_GAIN,
+    WIDE_S,
+    Prior,
+    SelfCalibration,
+)
+from omsm_ros.units import MICROSECOND_S, NANOMETRE_M, RPM_RAD_S
+
+SCOPE = (
+    "identified on a surface that Z follows, where latency leaves no trace: the response is that "
+    "of the structure, for surfaces followed as closely; a step test besides tells the latency"
+)
+# One clean run in ten thousand.
+_SURPRISE_P = 1e-4
+# A spindle keeps its speed to better than that.
+_SAME_SPEED = 0.01
+# The low-order model's own poles, well above what moved and well below Nyquist.
+_POLE_SHARE_OF_RATE = 0.2
+
+
+def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibration:
+    """Return the calibration that corrects nothing, for data of ``sample_period`` [s]."""
+    nothing = TransferFunction(np.ones(1), np.ones(1))
+    return Calibration(
+        dynamics=nothing,
+        static_gain=static_gain,
+        sample_period=sample_period,
+        valid_up_to=0.5 / sample_period,
+        covariance=np.zeros((2, 2)),
+        certificate={"verdict": "accepted"},
+    )
+
+
+def without_step_test(gain_uncertainty: float = WIDE_GAIN) -> Prior:
+    """Return what is known of a machine that was never tested: next to nothing.
+
+    gain_uncertainty: of the static gain, as a share of it
+    """
+    return Prior(np.diag([WIDE_S, WIDE_CURVATURE_S2, gain_uncertainty, WIDE_S]) ** 2)
+
+
+def after_step_test(calibration: Calibration) -> Prior:
+    """Return what a step test leaves open: its lag, curvature and gain within its covariance."""
+    jacobian = slow_motion_jacobian(calibration.dynamics)
+    covariance = np.zeros((DYNAMIC, DYNAMIC))
+    covariance[:GAIN, :GAIN] = jacobian @ calibration.covariance @ jacobian.T
+    stated = calibration.certificate.get("static_gain_uncertainty", 0.0)
+    relative = float(stated) / calibration.static_gain  # type: ignore[arg-type]
+    covariance[GAIN, GAIN] = relative**2
+    covariance[LATENCY, LATENCY] = WIDE_S**2
+    return Prior(covariance)
+
+
+def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
+    """Return ``calibration`` with what the scans corrected with it tell besides.
+
+    What they tell of lag and curvature narrows the covariance Σ of all parameters: with J the
+    Jacobian of the two, and K = Σ Jᵀ (J Σ Jᵀ)⁻¹, to ``Σ - K (J Σ Jᵀ - P) Kᵀ``, P what is left.
+    """
+    g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
+    jacobian = slow_motion_jacobian(g)
+    prior = jacobian @ sigma @ jacobian.T
+    gain = sigma @ jacobian.T @ _inverse_of_what_varies(prior)
+    change = prior - found.covariance[:GAIN, :GAIN]
+    covariance = sigma - gain @ change @ gain.T
+    lag = g.low_frequency_delay
+    certificate = {
+        **calibration.certificate,
+        **_entries(found),
+        ENTRY: _latency(found, lag).entry(),
+        "low_frequency_delay_s": lag,
+        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
+    }
+    return replace(
+        calibration,
+        dynamics=g,
+        covariance=(covariance + covariance.T) / 2,
+        certificate=_judged(certificate, found),
+    )
+
+
+def from_scans_alone(
+    found: SelfCalibration,
+    sample_period: float,
+    static_gain: float,
+    settings: Mapping[str, object],
+) -> Calibration:
+    """Return a calibration of low order from scans corrected with :func:`unit_calibration`.
+
+    ``N/D e^{-τs}`` with D a fast double pole and N such that the lag and the curvature are
+    those found.
+    """
+    latency = max(float(found.values[LATENCY]), 0.0)
+    total, curvature = float(found.values[LAG]), float(found.values[CURVATURE])
+    lag = total - latency
+    curvature += latency**2 / 2 - total * latency
+    slow = sample_period / (2 * np.pi * _POLE_SHARE_OF_RATE)
+    denominator = np.array([1.0, 2 * slow, slow**2])
+    numerator = np.array([1.0, 2 * slow - lag, slow**2 - 2 * slow * lag + curvature])
+    by_found = np.zeros((6, DYNAMIC))
+    by_found[1] = [-1, 0, 0, 1]
+    by_found[2] = [-2 * slow - latency, 1, 0, 2 * slow + latency - total]
+    by_found[5, LATENCY] = 1.0
+    dynamics = TransferFunction(numerator, denominator, latency)
+    trusted = min(_highest_excited(found), 0.5 / sample_period)
+    certificate: dict[str, object] = {
+        **_entries(found),
+        "static_gain": static_gain,
+        "static_gain_uncertainty": float(np.sqrt(found.covariance[GAIN, GAIN])) * static_gain,
+        ENTRY: _latency(found, dynamics.low_frequency_delay).entry(),
+        "noise_m": found.agreement.noise,
+        "low_frequency_delay_s": dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
+        "warnings": [] if found.known[LATENCY] else [SCOPE],
+        "reasons": [],
+        "verdict": f"accepted up to {trusted:.3g} Hz",
+    }
+    return Calibration(
+        dynamics=dynamics,
+        static_gain=static_gain,
+        sample_period=sample_period,
+        valid_up_to=trusted,
+        covariance=by_found @ found.covariance @ by_found.T,
+        settings=settings,
+        certificate=_judged(certificate, found),
+    )
+
+
+def _moved(
+    calibration: Calibration, lag: float, curvature: float
+) -> tuple[TransferFunction, FloatArray]:
+    """G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
+
+    Only the numerator changes, so the poles stay where they are; it grows to the second
+    degree where the denominator allows it.
+    """
+    g = calibration.dynamics
+    degree = len(g.numerator) - 1
+    wanted = min(max(degree, 2), len(g.denominator) - 1)
+    grown = [0.0] * (wanted - degree)
+    numerator = np.append(g.numerator, grown)
+    factor = np.array([1.0, -lag, curvature])[: min(wanted, 2) + 1]
+    numerator[: len(factor)] = np.convolve(numerator, factor)[: len(factor)]
+    covariance = calibration.covariance
+    for _ in grown:
+        covariance = np.insert(np.insert(covariance, degree + 1, 0.0, 0), degree + 1, 0.0, 1)
+    delay = g.delay if wanted else max(g.delay + lag, 0.0)
+    return TransferFunction(numerator, g.denominator, delay), covariance
+
+
+def _latency(found: SelfCalibration, lag: float) -> Latency:
+    source = REVERSAL if _same(np.abs(found.speeds)) else SPEEDS
+    _, structure = found.structure
+    # What the lag of Z, in the covariance of the dynamics, does not hold already.
+    beside = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
+    if not found.known[LATENCY]:
+        return Latency(
+            delay_s=0.0,
+            uncertainty_s=None,
+            beside_z_s=beside,
+            share=None,
+            source=source,
+            reason=SCOPE,
+        )
+    delay = max(float(found.values[LATENCY]), 0.0)
+    rpm = ", ".join(f"{speed / RPM_RAD_S:.4g}" for speed in found.speeds)
+    return Latency(
+        delay_s=delay,
+        uncertainty_s=float(np.sqrt(found.covariance[LATENCY, LATENCY])),
+        beside_z_s=beside,
+        share=share_of(delay, lag),
+        source=source,
+        reason=f"{len(found.speeds)} scans of one part at {rpm} rpm",
+    )
+
+
+def _same(speeds: FloatArray) -> bool:
+    return bool(np.ptp(speeds) < _SAME_SPEED * np.max(speeds))
+
+
+def _entries(found: SelfCalibration) -> dict[str, object]:
+    return {
+        "self_calibration": {
+            "speeds_rad_s": list(found.speeds),
+            "points": found.points,
+            "residual_rms_m": found.residual,
+            "left_on_this_surface_m": found.followed,
+            "agreement": asdict(found.agreement),
+            "surprise_chi2": found.surprise,
+            "between_scans": [
+                {
+                    name: {"value": float(value), "uncertainty": float(spread)}
+                    for name, value, spread in zip(OWN, values, spreads, strict=True)
+                }
+                for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
+            ],
+            "not_told": untold(found),
+        },
+    }
+
+
+def untold(found: SelfCalibration) -> list[str]:
+    """Return what the scans could not tell, why, and what would tell it."""
+    told = []
+    if not found.known[LATENCY]:
+        told.append(
+            "latency: where Z follows the surface it leaves no trace; a step test "
+            "(--calibration) together with these scans tells it"
+        )
+    if not found.known[CURVATURE]:
+        told.append(
+            "curvature of the gain: the scans run equally fast, so it passes for the surface; "
+            "scan at another speed"
+        )
+    told.append(
+        "a gain common to all speeds: it scales the surface in every scan alike; only a "
+        "reference can tell it"
+    )
+    return told
+
+
+def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:
+    """The certificate with the scans' own reasons for and against."""
+    reasons = []
+    if not found.agreement.holds:
+        reasons.append(
+            f"the scans contradict each other by {found.agreement.disagreement / NANOMETRE_M:.1f} "
+            f"nm rms, {found.agreement.ratio:.1f} times what noise explains; the part moved, or "
+            "something else than speed changed between them: let the machine settle and repeat"
+        )
+    if stats.chi2.sf(found.surprise, GAIN) < _SURPRISE_P:
+        shift = found.values[LAG] / MICROSECOND_S
+        reasons.append(
+            f"scans and step test contradict each other: the lag would have to change by "
+            f"{shift:.2f} µs, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
+            "repeat the step test with the settings of the scans"
+        )
+    if not reasons:
+        return certificate
+    before = certificate.get("reasons")
+    all_reasons = [*(before if isinstance(before, list) else []), *reasons]
+    return certificate | {"reasons": all_reasons, "verdict": REJECTED}
+
+
+def _highest_excited(found: SelfCalibration) -> float:
+    """Highest frequency [Hz] at which the surface shows a response off by the usual limits."""
+    known = found.agreement.noise * np.sqrt(2 / found.points)
+    limits = ResponseLimits()
+    excited = found.amplitudes * min(limits.gain, limits.phase) > COVERAGE_FACTOR * known
+    highest = int(np.max(np.flatnonzero(excited), initial=0)) + 1
+    return highest * max(map(abs, found.speeds)) / (2 * np.pi)
+
+
+def _inverse_of_what_varies(matrix: FloatArray) -> FloatArray:
+    """Inverse of a covariance (2, 2) whose rows have different units and may be zero."""
+    deviation = np.sqrt(np.diag(matrix))
+    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+    correlation = matrix * scale * scale[:, np.newaxis]
+    return np.asarray(np.linalg.pinv(correlation, hermitian=True) * scale * scale[:, np.newaxis])

@@ -1,0 +1,330 @@
+"""What do scans of one part, at different speeds or directions, tell of the dynamics?
+
+The surface is common to all scans and eliminated (:mod:`eliminated_surface`); what grows with
+the speed, or turns with the direction, remains (:mod:`scan_model`). Gauss-Newton on latency
+and clocking; all else is linear. The covariance comes from the residuals of whole rings of
+the part, all scans together, so that texture, vibration and spindle error, which are the same
+at the same place or last for turns, do not pass for knowledge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.verification.eliminated_surface import Portion, normal_equations
+from omsm_ros.core.verification.scan_agreement import Agreement, AgreementSums
+from omsm_ros.core.verification.scan_model import (
+    CLOCKING,
+    CURVATURE,
+    DYNAMIC,
+    GAIN,
+    LAG,
+    LATENCY,
+    Place,
+    ScanModel,
+)
+from omsm_ros.core.verification.scan_reader import ScanColumns
+from omsm_ros.errors import DataError
+
+# The paper's off-axis mirror has 2 nm in the sixth harmonic, and 4 pm in the eighth.
+DEFAULT_HARMONICS = 12
+# A tenth of a second of arc: what the index of a good rotary encoder repeats to.
+DEFAULT_CLOCKING_RAD = 5e-7
+# A part that stays on the chuck moves by warming alone; on an off-axis paraboloid a shift and
+# a tilt together look like clocking, so what is allowed here limits what can be told.
+DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
+_FREE = 1e6
+# Where the noise is looked for; the residuals tell it after one step.
+_NOISE_M = 10e-9
+# Keeps what is exactly known from dividing by zero: ns, as²; far below any effect.
+_FLOOR = np.array([1e-9, 1e-13, 1e-9, 1e-9])
+_NONE: BoolArray = np.zeros(DYNAMIC, np.bool_)
+# Without them the rest is still worth having; the one that costs least goes first.
+_MAY_STAY_UNKNOWN = (LATENCY, CURVATURE)
+_ITERATIONS = 6
+_CONVERGED_S = 1e-8
+# They tell a lag to a microsecond, and what a step leaves is of second order in that.
+_ENOUGH_POINTS = 40_000
+_MOST_RINGS, _LEAST_RINGS = 60, 12
+# What the scans narrow to less than this part of what was assumed is known from them.
+_KNOWN = 0.01
+# A lag known no better than this is no knowledge: longer than any that is looked for.
+_LONGEST_LAG_S = 10e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before: covariance of lag [s], curvature [s²], gain [1], latency [s], (4, 4).
+
+    clocking, shift, tilt: of the part from scan to scan, standard uncertainties [rad], [m], [rad];
+        inf for a clocking that nobody knows, because the part was mounted anew
+    """
+
+    covariance: FloatArray
+    clocking: float = DEFAULT_CLOCKING_RAD
+    shift: float = DEFAULT_SHIFT_M
+    tilt: float = DEFAULT_TILT_RAD
+
+
+WIDE_S = _LONGEST_LAG_S
+# A mode at 2.5 Hz with a thousandth of the motion has 4e-6 s².
+WIDE_CURVATURE_S2 = 1e-4
+# The paper's probe is 0.8 % off.
+WIDE_GAIN = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """What the scans tell, in the names of :mod:`scan_model`.
+
+    values, covariance: of lag, curvature, gain, latency, with the prior, (4,) and (4, 4); the
+        gain stays as it was, and its uncertainty counts
+    known: which of them the scans or the prior tell, (4,);  speeds: of the scans [rad/s]
+    residual: rms [m];  followed: standard uncertainty that the four leave on the heights of
+        this surface, rms [m];  agreement: of the scans with each other
+    surprise: χ² of lag and curvature against the prior, 2 degrees of freedom
+    own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan but the first
+    amplitudes: rms over the part of each harmonic of the surface, from 1 [m]
+    points: fitted
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    known: BoolArray
+    speeds: tuple[float, ...]
+    residual: float
+    followed: float
+    agreement: Agreement
+    surprise: float
+    own: FloatArray
+    own_uncertainty: FloatArray
+    amplitudes: FloatArray
+    points: int
+
+    @property
+    def structure(self) -> tuple[float, float]:
+        """Lag less latency, as far as the correction had it wrong, and its uncertainty [s]."""
+        direction = np.zeros(DYNAMIC)
+        direction[LAG], direction[LATENCY] = 1.0, -1.0
+        variance = float(direction @ self.covariance @ direction)
+        return float(direction @ self.values), float(np.sqrt(variance))
+
+
+def self_calibrate(
+    scans: Sequence[ScanColumns], prior: Prior, harmonics: int = DEFAULT_HARMONICS
+) -> SelfCalibration:
+    """Return what two or more scans of one part tell of the dynamics.
+
+    Raises DataError where they cannot tell anything: one speed and direction, a surface
+    without slope along the path, or a part that was re-mounted.
+    """
+    model = ScanModel(scans, harmonics)
+    fit = _Fit(model, prior)
+    for index in _MAY_STAY_UNKNOWN:
+        if fit.unknown[index]:
+            fit = fit.without(index)
+    found = fit.result()
+    if not found.structure[1] < _KNOWN * WIDE_S:
+        raise DataError(_untold(model, prior))
+    return found
+
+
+def _untold(model: ScanModel, prior: Prior) -> str:
+    speeds = ", ".join(f"{s * 30 / np.pi:.1f}" for s in model.speeds)
+    if not np.isfinite(prior.clocking):
+        return (
+            "a part that was mounted anew is turned by an unknown angle, which looks as a lag "
+            "does; scan it at both speeds without taking it off, or state how well it was clocked"
+        )
+    if np.ptp(model.speeds) < _KNOWN * max(map(abs, model.speeds)):
+        return (
+            f"the scans all run at {speeds} rpm, so a lag is the same in each and passes for the "
+            "surface; scan at another speed, or in the other direction"
+        )
+    return (
+        f"the scans at {speeds} rpm do not show a lag: the surface does not change along the path; "
+        "scan one that is not symmetric about the spindle"
+    )
+
+
+class _Fit:
+    """Gauss-Newton with a prior; linear but for latency and clocking."""
+
+    def __init__(self, model: ScanModel, prior: Prior, omitted: BoolArray = _NONE) -> None:
+        self._model, self._prior, self._omitted = model, prior, omitted
+        self._precision = _precision(
+            model, replace(prior, covariance=_held(prior.covariance, GAIN))
+        )
+        self._place = Place(0.0, np.zeros(model.number))
+        self._surface: FloatArray | None = None
+        self._variance = _NOISE_M**2
+        self._iterate()
+
+    def without(self, index: int) -> _Fit:
+        """The same fit with one of the four left as it is, for the scans cannot tell it."""
+        covariance = _held(self._prior.covariance, index)
+        omitted = self._omitted | (np.arange(DYNAMIC) == index)
+        return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
+
+    @property
+    def unknown(self) -> BoolArray:
+        """Which of the four neither the prior nor the scans tell, (4,)."""
+        posterior = np.diag(_inverse(self._matrix))[:DYNAMIC]
+        assumed = np.diag(self._prior.covariance)
+        wide = assumed >= np.array([WIDE_S, WIDE_CURVATURE_S2, np.inf, WIDE_S]) ** 2 / 4
+        return np.asarray(self._omitted | (wide & (posterior > _KNOWN**2 * assumed)))
+
+    def _iterate(self) -> None:
+        """Converge on some of the points; for that is only to know where to linearise."""
+        every = max(len(self._model) // _ENOUGH_POINTS, 1)
+        for _ in range(_ITERATIONS):
+            before, started = self._place.latency, self._surface is not None
+            self._step(every)
+            if started and abs(self._place.latency - before) < _CONVERGED_S:
+                return
+
+    def _step(self, every: int) -> None:
+        model, place, surface = self._model, self._place, self._surface
+        equations = normal_equations(
+            model.basis,
+            model.portions(place, every),
+            lambda part: model.columns(part, place, surface),
+        )
+        self._matrix = every * equations.matrix / self._variance + self._precision
+        parameters = _inverse(self._matrix) @ equations.right * (every / self._variance)
+        self._variance = every * equations.misfit(parameters) / len(model)
+        self._surface = equations.surface_of(parameters)
+        self._equations, self._parameters = equations, parameters
+        clocking = [parameters[model.own(k).start + CLOCKING] for k in range(1, model.number)]
+        self._place = Place(float(parameters[LATENCY]), np.array([0.0, *clocking]))
+
+    def result(self) -> SelfCalibration:
+        """Residuals, covariance by rings, and what is said of the scans."""
+        self._step(every=1)
+        model, parameters = self._model, self._parameters
+        seen = _Seen(model, self._equations.shares)
+        assert self._surface is not None
+        for part in model.portions(self._place, 1):
+            seen.add(
+                part, *model.columns(part, self._place, self._surface), parameters, self._surface
+            )
+        inverse = _inverse(self._matrix)
+        meat = seen.meat() / self._variance**2 + self._precision
+        covariance = inverse @ meat @ inverse + self._by_gain(inverse)
+        four = slice(DYNAMIC)
+        own = np.array([model.own(k) for k in range(1, model.number)], object)
+        deviation = np.sqrt(np.diag(covariance))
+        return SelfCalibration(
+            values=parameters[four],
+            covariance=covariance[four, four],
+            known=~self.unknown,
+            speeds=tuple(model.speeds),
+            residual=float(np.sqrt(seen.square / len(model))),
+            followed=seen.followed(covariance[four, four]),
+            agreement=seen.agreement.result(),
+            surprise=_surprise(parameters, self._prior.covariance),
+            own=np.array([parameters[o] for o in own]),
+            own_uncertainty=np.array([deviation[o] for o in own]),
+            amplitudes=model.basis.amplitudes(self._surface),
+            points=len(model),
+        )
+
+    def _by_gain(self, inverse: FloatArray) -> FloatArray:
+        """What an uncertain gain adds to the covariance, (parameters, parameters).
+
+        It is not estimated: on a surface that Z follows it shows in third order of the following
+        error only, where other terms that are not modelled show too.
+        """
+        change = -inverse @ self._equations.matrix[:, GAIN] / self._variance
+        change[GAIN] = 1.0
+        return np.asarray(np.outer(change, change) * self._prior.covariance[GAIN, GAIN])
+
+
+class _Seen:
+    """Gathers, at the end of the fit, what the residuals tell."""
+
+    def __init__(self, model: ScanModel, shares: FloatArray) -> None:
+        self._model, self._shares = model, shares
+        rings = int(np.clip(min(model.turns), _LEAST_RINGS, _MOST_RINGS))
+        self._scores = np.zeros((rings, model.size))
+        self._second = np.zeros((DYNAMIC, DYNAMIC))
+        self.square = 0.0
+        basis = model.basis
+        self.agreement = AgreementSums(model.number, basis.inner, basis.outer)
+
+    def add(
+        self,
+        part: Portion,
+        x: FloatArray,
+        y: FloatArray,
+        parameters: FloatArray,
+        surface: FloatArray,
+    ) -> None:
+        model, basis = self._model, self._model.basis
+        terms, here = part.rows.matrix(), basis.terms(part.interval)
+        residual = y - x @ parameters - terms @ surface[here]
+        free = x - terms @ self._shares[here]
+        radius, angle = model.radius(part), model.angle(part)
+        depth = (radius - basis.inner) / (basis.outer - basis.inner)
+        ring = np.clip(depth * len(self._scores), 0, len(self._scores) - 1).astype(np.int64)
+        for number in np.unique(ring):
+            mine = ring == number
+            self._scores[number] += residual[mine] @ free[mine]
+        four = x[:, :DYNAMIC].copy()
+        four[:, GAIN] += terms @ surface[here]
+        self._second += four.T @ four
+        self.square += float(residual @ residual)
+        scan = model.scan[part.points]
+        for k in np.unique(scan):
+            mine = scan == k
+            self.agreement.add(int(k), radius[mine], angle[mine], residual[mine])
+
+    def meat(self) -> FloatArray:
+        """Covariance of the scores, (parameters, parameters); a ring varies as a whole."""
+        rings = len(self._scores)
+        return np.asarray(self._scores.T @ self._scores * (rings / (rings - 1)))
+
+    def followed(self, covariance: FloatArray) -> float:
+        """Standard uncertainty of the heights by the four parameters, rms over all points [m]."""
+        mean_square = float(np.sum(self._second * covariance)) / len(self._model)
+        return float(np.sqrt(max(mean_square, 0.0)))
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Of a positive matrix whose rows have different units."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    return np.asarray(
+        scale[:, np.newaxis] * linalg.inv(matrix * scale * scale[:, np.newaxis]) * scale
+    )
+
+
+def _precision(model: ScanModel, prior: Prior) -> FloatArray:
+    """Inverse of the prior's covariance, (parameters, parameters)."""
+    precision = np.eye(model.size) / _FREE**2
+    four = slice(DYNAMIC)
+    precision[four, four] = _inverse(prior.covariance + np.diag(_FLOOR**2))
+    stated = np.array([prior.clocking, prior.shift, prior.shift, prior.tilt, prior.tilt])
+    for k in range(1, model.number):
+        own = model.own(k)
+        precision[own, own] = np.diag(stated**-2.0)
+    return precision
+
+
+def _held(covariance: FloatArray, index: int) -> FloatArray:
+    """The same with one quantity at its value."""
+    held = covariance.copy()
+    held[index], held[:, index] = 0.0, 0.0
+    return held
+
+
+def _surprise(parameters: FloatArray, covariance: FloatArray) -> float:
+    """χ² of lag and curvature against what was known before."""
+    two = slice(GAIN)
+    off = parameters[two]
+    known = covariance[two, two] + np.diag(_FLOOR[two] ** 2)
+    return float(off @ _inverse(known) @ off)
