@@ -125,13 +125,12 @@ def self_calibrate(
     """
     model = ScanModel(scans, harmonics)
     fit = _Fit(model, prior)
+    if not fit.tells:
+        raise DataError(_untold(model, prior))
     for index in _MAY_STAY_UNKNOWN:
         if fit.unknown[index]:
             fit = fit.without(index)
-    found = fit.result()
-    if not found.structure[1] < _KNOWN * WIDE_S:
-        raise DataError(_untold(model, prior))
-    return found
+    return fit.result()
 
 
 def _untold(model: ScanModel, prior: Prior) -> str:
@@ -170,6 +169,13 @@ class _Fit:
         covariance = _held(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
         return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
+
+    @property
+    def tells(self) -> bool:
+        """False if the scans leave lag less latency as open as it was."""
+        inverse, two = _inverse(self._matrix), [LAG, LATENCY]
+        (lag, mixed), (_, latency) = inverse[np.ix_(two, two)]
+        return bool(lag - 2 * mixed + latency < (_KNOWN * WIDE_S) ** 2)
 
     @property
     def unknown(self) -> BoolArray:

@@ -1,0 +1,74 @@
+"""The surface's basis against closed forms and differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.verification.polar_surface import PolarBasis, spline_columns
+
+BASIS = PolarBasis(inner=1e-3, outer=13e-3, intervals=6, harmonics=3)
+
+
+def matrix(radius: FloatArray, angle: FloatArray) -> FloatArray:
+    rows = np.zeros((len(radius), BASIS.size))
+    interval = BASIS.interval(radius)
+    for k in range(BASIS.intervals):
+        mine = interval == k
+        rows[mine, BASIS.terms(k)] = BASIS.rows(k, radius[mine], angle[mine]).matrix()
+    return rows
+
+
+def points(count: int) -> tuple[FloatArray, FloatArray]:
+    random = np.random.default_rng(1)
+    return random.uniform(1e-3, 13e-3, count), random.uniform(-np.pi, np.pi, count)
+
+
+def test_a_cubic_of_radius_times_a_harmonic_is_in_the_basis() -> None:
+    radius, angle = points(3000)
+    height = (radius / 1e-2) ** 3 * np.cos(2 * angle) + radius / 1e-2 * np.sin(3 * angle) + 0.3
+    terms = matrix(radius, angle)
+    fitted = terms @ np.linalg.lstsq(terms, height, rcond=None)[0]
+    np.testing.assert_allclose(fitted, height, atol=1e-11)
+
+
+def test_splines_sum_to_one() -> None:
+    place = np.linspace(0.0, 5.0, 101)
+    np.testing.assert_allclose(spline_columns(place, 5).sum(axis=1), 1.0, rtol=1e-13)
+    assert spline_columns(place, 5).shape == (101, 8)
+
+
+def test_derivatives_are_those_of_the_heights() -> None:
+    random = np.random.default_rng(2)
+    coefficients = random.normal(size=4 * BASIS.waves)
+    radius, angle = random.uniform(5e-3, 7e-3, 50), random.uniform(-3, 3, 50)
+    radial, angular = BASIS.rows(2, radius, angle).derivatives(coefficients)
+
+    def height(r: FloatArray, a: FloatArray) -> FloatArray:
+        rows = BASIS.rows(2, r, a)
+        np.testing.assert_allclose(rows.heights(coefficients), rows.matrix() @ coefficients)
+        return rows.heights(coefficients)
+
+    step = 1e-7
+    along = (height(radius + step, angle) - height(radius - step, angle)) / (2 * step)
+    around = (height(radius, angle + step) - height(radius, angle - step)) / (2 * step)
+    np.testing.assert_allclose(radial, along, rtol=1e-5, atol=1e-2)
+    np.testing.assert_allclose(angular, around, rtol=1e-5, atol=1e-6)
+
+
+def test_amplitudes_are_those_of_the_harmonics() -> None:
+    radius, angle = points(3000)
+    terms = matrix(radius, angle)
+    height = 2e-6 * np.cos(2 * angle - 0.4) + 1e-6
+    coefficients = np.linalg.lstsq(terms, height, rcond=None)[0]
+    assert BASIS.amplitudes(coefficients) == pytest.approx([0.0, 2e-6, 0.0], abs=1e-15)
+
+
+def test_neighbouring_intervals_meet() -> None:
+    edge = np.array([BASIS.inner + 2 * BASIS.width])
+    coefficients = np.random.default_rng(3).normal(size=BASIS.size)
+    before, after = (
+        BASIS.rows(k, edge, np.array([0.7])).heights(coefficients[BASIS.terms(k)]) for k in (1, 2)
+    )
+    np.testing.assert_allclose(before, after, rtol=1e-12)
