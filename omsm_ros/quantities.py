@@ -163,6 +163,9 @@ UNCERTAINTY = Quantity("standard uncertainty", "m", 0.0, 10.0, "give it in metre
 TIME_UNCERTAINTY = Quantity("standard uncertainty", "s", 0.0, 1.0, "give it in seconds, k = 1")
 GAIN_UNCERTAINTY = Quantity("standard uncertainty", "", 0.0, 1e6, "give it as a share, k = 1")
 BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2")
+ANGLE_UNCERTAINTY = Quantity(
+    "standard uncertainty", "rad", 0.0, 10.0, "give it in radians, k = 1; 10 = not known"
+)
 LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
 
 STAMP_DELAY = Quantity("delay of the exposure", "s", -10.0, 10.0, "give it in seconds")
@@ -180,5 +183,6 @@ BUFFER_SAMPLES = Quantity(
 COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
+HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
 PROBABILITY = Quantity("probability", "", 0.0, 1.0, "give a share between 0 and 1")
 SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")

@@ -6,7 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.cli.command import Command, Facts, json_object, positive, progress_bar, table
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
@@ -32,20 +34,29 @@ def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--calibration", type=Path, metavar="STEP.json", help="from a step test")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
-        "--harmonics", type=int, default=DEFAULT_HARMONICS, help="highest of the surface in a turn"
+        "--harmonics",
+        type=number(quantities.HARMONICS),
+        default=DEFAULT_HARMONICS,
+        help="highest of the surface in a turn",
     )
     sub.add_argument(
         "--clocking",
-        type=float,
+        type=number(quantities.ANGLE_UNCERTAINTY),
         default=DEFAULT_CLOCKING_RAD,
-        help="standard uncertainty of C between the scans [rad]; inf if the part was re-mounted",
+        help="standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
     )
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
     sub.add_argument(
-        "--static-gain", type=positive, default=1.0, help="of the probe, without a step test"
+        "--static-gain",
+        type=number(quantities.GAIN),
+        default=1.0,
+        help="of the probe, without a step test",
     )
     sub.add_argument(
-        "--gain-uncertainty", type=positive, default=WIDE_GAIN, help="standard, as a share of it"
+        "--gain-uncertainty",
+        type=number(quantities.GAIN_UNCERTAINTY),
+        default=WIDE_GAIN,
+        help="standard, as a share of it",
     )
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="without a step test"
@@ -175,8 +186,9 @@ def _show_reversal(facts: Facts) -> None:
 
 def _declare_latency(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("calibration", type=Path, metavar="CAL.json")
-    sub.add_argument("--delay", type=float, required=True, help="of the probe [s]; 0 for none")
-    sub.add_argument("--uncertainty", type=float, required=True, help="standard, k = 1 [s]")
+    delay, spread = number(quantities.LAG), number(quantities.TIME_UNCERTAINTY)
+    sub.add_argument("--delay", type=delay, required=True, help="of the probe [s]; 0 for none")
+    sub.add_argument("--uncertainty", type=spread, required=True, help="standard, k = 1 [s]")
     sub.add_argument("--reason", required=True, help="where the figure comes from")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
 

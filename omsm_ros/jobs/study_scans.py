@@ -53,7 +53,7 @@ class SelfCalibrationOptions:
     """How to calibrate on the part itself.
 
     harmonics: highest of the surface in a turn
-    clocking: standard uncertainty of C from scan to scan [rad], inf if the part was re-mounted
+    clocking: standard uncertainty of C from scan to scan [rad], 10 if the part was re-mounted
     polarity, static_gain, gain_uncertainty, settings: of the probe, without a step test to tell
         them; the uncertainty is a share of the gain
     """

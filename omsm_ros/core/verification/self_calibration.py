@@ -42,7 +42,10 @@ _FREE = 1e6
 # Where the noise is looked for; the residuals tell it after one step.
 _NOISE_M = 10e-9
 # Keeps what is exactly known from dividing by zero: ns, as²; far below any effect.
+_LEAST_STATED = 1e-12
 _FLOOR = np.array([1e-9, 1e-13, 1e-9, 1e-9])
+# No encoder repeats as badly; who states so means a part mounted by hand.
+_REMOUNTED_RAD = 1e-4
 _NONE: BoolArray = np.zeros(DYNAMIC, np.bool_)
 # Without them the rest is still worth having; the one that costs least goes first.
 _MAY_STAY_UNKNOWN = (LATENCY, CURVATURE)
@@ -62,7 +65,7 @@ class Prior:
     """What is known before: covariance of lag [s], curvature [s²], gain [1], latency [s], (4, 4).
 
     clocking, shift, tilt: of the part from scan to scan, standard uncertainties [rad], [m], [rad];
-        inf for a clocking that nobody knows, because the part was mounted anew
+        10 for a clocking that nobody knows, because the part was mounted anew
     """
 
     covariance: FloatArray
@@ -135,7 +138,7 @@ def self_calibrate(
 
 def _untold(model: ScanModel, prior: Prior) -> str:
     speeds = ", ".join(f"{s * 30 / np.pi:.1f}" for s in model.speeds)
-    if not np.isfinite(prior.clocking):
+    if prior.clocking > _REMOUNTED_RAD:
         return (
             "a part that was mounted anew is turned by an unknown angle, which looks as a lag "
             "does; scan it at both speeds without taking it off, or state how well it was clocked"
@@ -315,6 +318,7 @@ def _precision(model: ScanModel, prior: Prior) -> FloatArray:
     four = slice(DYNAMIC)
     precision[four, four] = _inverse(prior.covariance + np.diag(_FLOOR**2))
     stated = np.array([prior.clocking, prior.shift, prior.shift, prior.tilt, prior.tilt])
+    stated = np.maximum(stated, _LEAST_STATED)
     for k in range(1, model.number):
         own = model.own(k)
         precision[own, own] = np.diag(stated**-2.0)
