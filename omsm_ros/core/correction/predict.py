@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.uncertainty import sensitivity_filters
+from omsm_ros.core.correction.uncertainty import ErrorSources, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
 from omsm_ros.core.dynamics.discretisation_error import (
@@ -127,7 +127,7 @@ def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: f
     (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
     it at either, the motion above the band is taken to be as large as next to them.
     """
-    variance = np.zeros(len(z))
+    variance = np.full(len(z), ErrorSources.of(calibration).motion_error ** 2)
     for digital in sensitivity_filters(calibration, sample_period):
         variance += _through(digital, z) ** 2
     digital = discretise(calibration.dynamics, sample_period)

@@ -42,6 +42,7 @@ class ErrorSources:
     encoder_noise: of z [m];  encoder_resolution: step of z [m]
     static_gain: of the calibration's static gain [1]
     lateral_lag: of the sideways lag [s]; it shifts the points along the path
+    motion_error: of what follows the motion but not linearly, backlash and the like [m]
     discretisation: of H against G on this motion [m]
     abbe: of z by pitch of the slide over its Abbe arm [m]
     """
@@ -52,6 +53,7 @@ class ErrorSources:
     encoder_resolution: float = 0.0
     static_gain: float = 0.0
     lateral_lag: float = 0.0
+    motion_error: float = 0.0
     discretisation: float = 0.0
     abbe: float = 0.0
 
@@ -69,6 +71,7 @@ class ErrorSources:
         return cls(
             probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
             static_gain=_standard_uncertainty(calibration.certificate, "static_gain_uncertainty"),
+            motion_error=_standard_uncertainty(calibration.certificate, "motion_error_m"),
         )
 
 
@@ -110,6 +113,7 @@ def contributions(
         "probe_resolution": (sources.probe_resolution / static_gain) ** 2 / 12,
         "encoder_noise": (noise_gain * sources.encoder_noise) ** 2,
         "encoder_resolution": (noise_gain * sources.encoder_resolution) ** 2 / 12,
+        "motion_error": sources.motion_error**2,
         "discretisation": sources.discretisation**2,
         "abbe": sources.abbe**2,
     }
@@ -132,15 +136,31 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
     """Filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none if the covariance is zero."""
     g = calibration.dynamics
     square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
-    combined = sensitivity_numerators(calibration)
+    combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
+    slow = at_rest_until(calibration)
+    if slow > 0:
+        # G(0) is one for certain: what is uncertain of the gain moves, see at_rest_until.
+        combined = slow * np.column_stack([np.zeros(len(combined)), combined])
+        square = np.asarray(polynomial.polymul(square, [1.0, slow]), np.float64)
+        poles = np.append(poles, -1 / slow)
     band = 2j * np.pi * np.linspace(0.0, calibration.valid_up_to, 64)
     power = np.abs(polynomial.polyval(band, combined.T)) ** 2
     share = power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny)
     return [
-        derivative_filter(numerator, square, g.delay, sample_period, np.tile(g.poles(), 2))
+        derivative_filter(numerator, square, g.delay, sample_period, poles)
         for numerator, largest in zip(combined, share.max(axis=1), strict=True)
         if largest > _NEGLIGIBLE
     ]
+
+
+def at_rest_until(calibration: Calibration) -> float:
+    """Time [s] over which a motion counts as rest, whose gain is one; 0 if there is no such.
+
+    A calibration that leaves open how slow relaxations go carries a variance of the whole
+    gain, which holds above ``valid_from`` of its certificate.
+    """
+    lowest = _standard_uncertainty(calibration.certificate, "valid_from")
+    return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
 
 
 def derivative_filter(

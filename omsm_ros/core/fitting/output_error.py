@@ -148,10 +148,13 @@ class Problem:
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
-        spectrum = fitted.driven @ self._driven(fitted.structure, lag)
-        moved = fft.irfft(spectrum, self.closed_length)[: len(self.input)]
+        moved = fft.irfft(self.answer(fitted), self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
+
+    def answer(self, fitted: Fit) -> ComplexArray:
+        """Spectrum of what the fitted model makes of all that drives it, at ``s``, (k,)."""
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        return np.asarray(fitted.driven @ self._driven(fitted.structure, lag))
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
         """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""

@@ -11,13 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.fitting.least_squares import least_squares, unexplained
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import Problem, fit
+from omsm_ros.core.fitting.least_squares import least_squares
+from omsm_ros.core.fitting.output_error import Problem
 from omsm_ros.core.fitting.steps import (
     LEAST_SAMPLES,
     Steps,
-    backlash_columns,
     check_usable,
     find_steps,
     sample_noise,
@@ -37,21 +35,15 @@ _FADE_SHAPE = 12.0
 _SPIKE_SIGMAS = 6.0
 # A probe is linear to a few per cent; beyond this a unit or a target is wrong.
 _PLAUSIBLE_GAIN = (0.5, 2.0)
-# χ² by which a column of the background must improve the fit to be taken: four sigma.
-_CLEARLY_SHOWN = 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A problem, the steps in its motion, and the number of single readings taken out.
-
-    backlash_column: of the problem's background, or None where the data show no backlash
-    """
+    """A problem, the steps in its motion, and the number of single readings taken out."""
 
     problem: Problem
     steps: Steps
     spikes: int
-    backlash_column: int | None
 
 
 def prepare(record: MotionRecord, source: str) -> Prepared:
@@ -67,8 +59,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
-    problem, backlash = _with_background(problem, steps)
-    return Prepared(problem, steps, spikes, backlash)
+    return Prepared(problem, steps, spikes)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:
@@ -201,20 +192,3 @@ def _without_spikes(problem: Problem) -> tuple[Problem, int]:
     limit = _SPIKE_SIGMAS * sample_noise(apart[np.isfinite(apart)]) + 2 * around
     spikes = np.isfinite(jump) & np.isfinite(around) & (jump > limit)
     return replace(problem, used=problem.used & ~spikes), int(np.sum(spikes))
-
-
-def _with_background(problem: Problem, steps: Steps) -> tuple[Problem, int | None]:
-    """Add curvature of the drift, and backlash, where the data clearly show them."""
-    residual = fit(problem, Structure(0, 0, True), [np.array([0.1])]).residual
-    ramp = problem.background[:, 1]
-    background, backlash_column = problem.background, None
-    play = backlash_columns(steps, len(ramp))
-    for columns, is_backlash in ((np.column_stack([ramp**2, ramp**3]), False), (play, True)):
-        known = np.column_stack([background, problem.input])[problem.used]
-        left = unexplained(known, residual)
-        after = unexplained(np.column_stack([known, columns[problem.used]]), residual)
-        improved = (float(left @ left) - float(after @ after)) / np.mean(after**2)
-        if columns.shape[1] and improved > _CLEARLY_SHOWN * columns.shape[1]:
-            backlash_column = background.shape[1] if is_backlash else backlash_column
-            background = np.column_stack([background, columns])
-    return replace(problem, background=background), backlash_column

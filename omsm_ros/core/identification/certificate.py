@@ -8,25 +8,17 @@ from itertools import chain
 
 import numpy as np
 
-from omsm_ros.core.dynamics.frequency_response import frequency_response
 from omsm_ros.core.dynamics.masses_and_springs import finite_values, shape
 from omsm_ros.core.dynamics.modes import modal_remainder, mode_entries
 from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.fitting.order_choice import Candidate
-from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.model_choice import Model
-from omsm_ros.core.identification.residual_tests import response_agreement
 from omsm_ros.core.identification.static_gains import static_gains
 from omsm_ros.core.identification.two_masses import two_mass_entry
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
-
-_AGREEMENT_SEGMENT_S = 1.0
-_LEAST_SEGMENTS = 8
-# Of the band up to half the sampling rate; the last line below it stands for the whole.
-_WHOLE_BAND = 0.999
 
 
 def certificate_of(
@@ -36,11 +28,12 @@ def certificate_of(
 
     table_mass: moving mass of the table [kg], None if it is not known
     """
-    nyquist = 0.5 / evidence.prepared.problem.period
+    known, valid_from = evidence.known, 1 / (2 * np.pi * evidence.searched.survey.slowest_creep)
     limits = dict(chain.from_iterable(finding.limits.items() for finding in findings))
     entries = dict(chain.from_iterable(finding.entries.items() for finding in findings))
     reasons = list(chain.from_iterable(finding.reasons for finding in findings))
     warnings = list(chain.from_iterable(finding.warnings for finding in findings))
+    reservations = list(chain.from_iterable(finding.reservations for finding in findings))
     return {
         **_order_entries(evidence.model),
         **_residual_entries(evidence),
@@ -50,20 +43,26 @@ def certificate_of(
             evidence.dynamics, evidence.known.covariance, evidence.known.valid_up_to, table_mass
         ),
         **entries,
+        "valid_from": valid_from,
         "limits": limits,
         "warnings": warnings,
         "reasons": reasons,
-        "verdict": verdict(reasons, evidence.known.valid_up_to, nyquist),
+        "reservations": reservations,
+        "verdict": verdict(reasons, reservations, valid_from, known.valid_up_to),
     }
 
 
-def verdict(reasons: Sequence[str], valid_up_to: float, nyquist: float) -> str:
-    """Return "rejected", "accepted", or "accepted up to" a frequency [Hz] below ``nyquist``."""
+def verdict(
+    reasons: Sequence[str], reservations: Sequence[str], valid_from: float, valid_up_to: float
+) -> str:
+    """Return "rejected", or "accepted" and the band [Hz] that the data support.
+
+    reservations: what was found in the data and is held by a wider band
+    """
     if reasons:
         return "rejected"
-    if valid_up_to < _WHOLE_BAND * nyquist:
-        return f"accepted up to {valid_up_to:.0f} Hz"
-    return "accepted"
+    kept = "accepted with reservations" if reservations else "accepted"
+    return f"{kept}, supported by data from {valid_from:.2g} to {valid_up_to:.0f} Hz"
 
 
 def _order_entries(model: Model) -> dict[str, object]:
@@ -92,13 +91,10 @@ def _residual_entries(evidence: Evidence) -> dict[str, object]:
     prepared, tests = evidence.prepared, evidence.residual
     compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
     return {
+        "noise_covariance": evidence.known.from_noise.ravel().tolist(),
         "residual_rms_m": evidence.fit.rms,
         "edges": len(prepared.steps.edges),
         "whiteness_p": tests.whiteness,
-        "independence_p": tests.independence,
-        "nonparametric_agreement": _agreement(
-            prepared.problem, evidence.fit, evidence.known.valid_up_to
-        ),
         "samples": dict(evidence.record.counts) | compared,
     }
 
@@ -118,8 +114,8 @@ def _response_entries(evidence: Evidence) -> dict[str, object]:
 
 
 def _gain_entries(evidence: Evidence) -> dict[str, object]:
-    """What is seen beside the response: gain, drift, backlash."""
-    best, column = evidence.fit, evidence.prepared.backlash_column
+    """What is seen beside the response: gain and drift."""
+    best = evidence.fit
     duration = len(evidence.record) * evidence.record.sample_period
     return {
         "static_gain": abs(best.gain),
@@ -127,7 +123,6 @@ def _gain_entries(evidence: Evidence) -> dict[str, object]:
         "static_gains": _attributed(evidence.record),
         "polarity": -int(np.sign(best.gain)),
         "drift_m_s": 2 * float(best.background[1]) / duration,
-        "backlash_m": 0.0 if column is None else 2 * abs(float(best.background[column])),
     }
 
 
@@ -137,13 +132,3 @@ def _attributed(record: MotionRecord) -> dict[str, object] | None:
         return asdict(static_gains(record))
     except StepTestError:
         return None
-
-
-def _agreement(problem: Problem, best: Fit, up_to: float) -> float | None:
-    residual = problem.on_grid(best.residual, 0.0)
-    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
-    segment = max(segment, 16)
-    value = response_agreement(
-        frequency_response(problem.input, residual, problem.period, segment), up_to
-    )
-    return value if np.isfinite(value) else None

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import gain_uncertainty_alone
+from omsm_ros.core.identification.departure_checks import agreement, departures, independence
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
 
@@ -110,6 +111,9 @@ def poles_beyond(dynamics: TransferFunction, valid_up_to: float) -> Finding:
 
 CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
+    lambda e: departures(e.searched),
+    lambda e: independence(e.searched.survey.independence),
+    lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: trusted_range(e.known.valid_up_to, e.limits),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),

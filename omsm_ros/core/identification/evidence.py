@@ -9,6 +9,7 @@ from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared
+from omsm_ros.core.identification.departure_search import Searched
 from omsm_ros.core.identification.model_choice import Model
 from omsm_ros.core.identification.residual_tests import ResidualTests, residual_tests
 from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
@@ -20,6 +21,7 @@ class Evidence:
     """The record, the problem fitted, the chosen model, and how well it is known.
 
     limits: of the 95 % band, within which the response is trusted
+    searched: departures from a steady linear response that were looked for
     noise: known standard deviation of one reading of the probe [m], or None
     """
 
@@ -28,6 +30,7 @@ class Evidence:
     model: Model
     known: ResponseUncertainty
     limits: ResponseLimits
+    searched: Searched
     noise: float | None = None
 
     @property

@@ -13,9 +13,11 @@ class Finding:
     entries: JSON values by their names in the certificate
     limits: what the entries are compared with, so that a reader can repeat the verdict
     reasons: why the calibration must not be used;  warnings: what a user has to know
+    reservations: what departs from a steady linear response, and is held by model or band
     """
 
     entries: Mapping[str, object] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    reservations: tuple[str, ...] = ()

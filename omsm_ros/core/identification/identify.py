@@ -6,8 +6,9 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 |---|---|
 | the record becomes a problem to fit | :mod:`omsm_ros.core.fitting.preparation` |
 | a model is chosen and fitted | :mod:`model_choice` |
+| what the residual shows besides is modelled | :mod:`departure_search` |
 | its covariance from noise | :mod:`response_uncertainty` |
-| further terms of it | :mod:`covariance_terms` |
+| further terms of it | :mod:`covariance_terms`, :mod:`hidden_terms` |
 | checks | :mod:`checks` |
 | certificate and verdict | :mod:`certificate` |
 """
@@ -23,7 +24,9 @@ from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
 from omsm_ros.core.identification.certificate import certificate_of
 from omsm_ros.core.identification.checks import CHECKS
+from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.hidden_terms import hidden_covariance
 from omsm_ros.core.identification.model_choice import choose_model, model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.identification.two_masses import table_mass
@@ -72,12 +75,18 @@ def identify(
     be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
     mass = table_mass(settings or {})
-    prepared, model = model_from_start(prepare(record, input), order)
+    searched = search(
+        prepare(record, input),
+        lambda prepared: model_from_start(prepared, order),
+        may_grow=not order,
+    )
+    prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
-    known = response_uncertainty(prepared, model, limits)
+    hidden = hidden_covariance(searched.survey, settings or {})
+    known = response_uncertainty(prepared, model, limits, hidden)
     if order:
         known = no_surer(known, prepared, model, choose_model(prepared), limits)
-    evidence = Evidence(record, prepared, model, known, limits, noise)
+    evidence = Evidence(record, prepared, model, known, limits, searched, noise)
     findings = [*known.findings, *(check(evidence) for check in CHECKS)]
     best = model.chosen.fit
     calibration = Calibration(

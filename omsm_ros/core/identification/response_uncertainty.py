@@ -19,7 +19,7 @@ from omsm_ros.core.dynamics.response_band import (
 from omsm_ros.core.fitting.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS
+from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS, CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.model_choice import Model
 from omsm_ros.core.samples.blocks import FloatArray
@@ -33,7 +33,7 @@ _EQUALLY_GOOD_BIC = 10.0
 class ResponseUncertainty:
     """How well the chosen model is known.
 
-    covariance: (p, p) of the coefficients, all terms included
+    covariance: (p, p) of the coefficients, all terms included;  from_noise: (p, p) without them
     gain_variance: of the gain of the probe per travel at rest [1]
     shown_up_to: [Hz] beyond which the motion would show no error of the response
     valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
@@ -42,6 +42,7 @@ class ResponseUncertainty:
     """
 
     covariance: FloatArray
+    from_noise: FloatArray
     gain_variance: float
     shown_up_to: float
     valid_up_to: float
@@ -51,21 +52,28 @@ class ResponseUncertainty:
 
 
 def response_uncertainty(
-    prepared: Prepared, model: Model, limits: ResponseLimits
+    prepared: Prepared,
+    model: Model,
+    limits: ResponseLimits,
+    hidden: Sequence[CovarianceTerm] = (),
 ) -> ResponseUncertainty:
-    """Return how well the chosen fit of ``model`` is known: noise, then each further term."""
+    """Return how well the chosen fit of ``model`` is known: noise, then each further term.
+
+    hidden: terms of what the residual of this very fit could hide
+    """
     problem, best = prepared.problem, model.chosen.fit
     size, dynamics = best.structure.size, best.dynamics
     passed = replace(dynamics, numerator=best.gain * dynamics.numerator)
     every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
     transform = best.scaled.coefficient_jacobian(best.nonlinear)
     from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
-    terms = [term(prepared, best, from_noise) for term in COVARIANCE_TERMS]
+    terms = [*(term(prepared, best, from_noise) for term in COVARIANCE_TERMS), *hidden]
     covariance = _symmetric(from_noise + np.sum([t.covariance for t in terms], axis=0))
     shown = _shown_up_to(problem, best, limits)
     band = response_band(dynamics, covariance, _frequencies(problem))
     return ResponseUncertainty(
         covariance=covariance,
+        from_noise=from_noise,
         gain_variance=float(every[size, size]),
         shown_up_to=shown,
         valid_up_to=_trusted_up_to(model, band, limits, shown),

@@ -1,0 +1,182 @@
+"""What departs from a linear, steady response, in plain words, and what can be done at the machine.
+
+What was modelled is a reservation: its uncertainty is in the band and in the budget. What
+shows and cannot be modelled rejects, with its cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from omsm_ros.core.dynamics.frequency_response import frequency_response
+from omsm_ros.core.fitting.covariance import parameter_covariance
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.identification.departure_search import ModelledTerm, Searched
+from omsm_ros.core.identification.departure_survey import FALSE_ALARM, Judged
+from omsm_ros.core.identification.departures import (
+    BACKLASH,
+    CREEP,
+    DRIFT,
+    FRICTION,
+    LINEARITY,
+    MODE,
+    PERIODIC,
+    STIFFENING,
+    VIBRATION,
+    Term,
+)
+from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.identification.residual_tests import response_agreement
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
+
+# No benign one of a hundred test records (noise, hum, drift, dropouts) comes above it.
+_WORST_AGREEMENT = 2.5
+_AGREEMENT_SEGMENT_S = 1.0
+_LEAST_SEGMENTS = 8
+# Share of its size that a departure costs on a scan, as a standard uncertainty: backlash and
+# friction lag by their whole half width, a sine by its rms.
+_ON_SCAN = {BACKLASH: 1.0, FRICTION: 1.0, PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
+_REMEDY = {
+    CREEP: "let the joints of probe and target settle, and rest longer on each plateau",
+    MODE: "look for what the machine stands on or carries loosely",
+    BACKLASH: "tighten the mount of the probe, or preload it",
+    FRICTION: "look for cables and seals that drag on the moving part",
+    STIFFENING: "make smaller steps, as large as the deflections of a scan",
+    LINEARITY: "use less of the probe's range, or linearise the probe",
+    PERIODIC: "make steps that are no multiple of that period",
+    VIBRATION: "find what runs at this frequency, or isolate the machine from it",
+    DRIFT: "let the machine warm up, and shield it",
+}
+
+
+def departures(searched: Searched) -> Finding:
+    """Return what was found beside the response, what in it, and what could not be modelled."""
+    fit, problem = searched.model.chosen.fit, searched.prepared.problem
+    beside = _sizes(problem, fit, searched.beside)
+    costs = [
+        _ON_SCAN.get(modelled.term.family, 0.0) * float(np.hypot(size, uncertainty))
+        for modelled, (size, uncertainty) in zip(searched.beside, beside, strict=True)
+    ]
+    entries = [
+        _entry(modelled.term, size, uncertainty)
+        for modelled, (size, uncertainty) in zip(searched.beside, beside, strict=True)
+    ]
+    backlash = [
+        2 * size
+        for modelled, (size, _) in zip(searched.beside, beside, strict=True)
+        if modelled.term.family == BACKLASH
+    ]
+    return Finding(
+        {
+            "departures": entries + [_entry(term, None, None) for term in searched.in_response],
+            "motion_error_m": float(np.sqrt(np.sum(np.square(costs)))),
+            "backlash_m": max(backlash, default=0.0),
+        },
+        {"false_alarm_p": FALSE_ALARM},
+        reasons=tuple(_unmodelled(judged) for judged in searched.unmodelled),
+        reservations=(
+            *(
+                f"{_words(modelled.term, size)}; it is modelled beside the response: "
+                + _REMEDY[modelled.term.family]
+                for modelled, (size, _) in zip(searched.beside, beside, strict=True)
+            ),
+            *(
+                f"{_words(term, None)}; it is part of the response: {_REMEDY[term.family]}"
+                for term in searched.in_response
+            ),
+        ),
+    )
+
+
+def _entry(term: Term, size: float | None, uncertainty: float | None) -> dict[str, object]:
+    return {
+        "family": term.family,
+        "parameter": term.parameter,
+        "size_m": size,
+        "uncertainty_m": uncertainty,
+        "modelled": "in the response" if size is None else "beside it",
+    }
+
+
+def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[tuple[float, float]]:
+    """Size of each modelled term and its standard uncertainty [m]."""
+    if not beside:
+        return []
+    columns = problem.sensitivity(fit)
+    covariance = parameter_covariance(problem, columns, fit.residual)
+    first = columns.shape[1] - problem.background.shape[1]
+    found = []
+    for modelled in beside:
+        coefficients = fit.background[modelled.columns]
+        part = slice(first + modelled.columns.start, first + modelled.columns.stop)
+        spread = covariance[part, part]
+        if modelled.term.family in (BACKLASH, FRICTION):
+            # The further column is its unknown state at the start.
+            coefficients, spread = coefficients[:1], spread[:1, :1]
+        if modelled.term.family == DRIFT:
+            added = problem.background[:, modelled.columns] @ coefficients
+            found.append((float(np.std(added)), float(np.sqrt(np.trace(spread) / 2))))
+            continue
+        found.append((float(np.linalg.norm(coefficients)), float(np.sqrt(np.trace(spread)))))
+    return found
+
+
+def _words(term: Term, size: float | None) -> str:
+    nanometres = "" if size is None else f" of {size / NANOMETRE_M:.3g} nm"
+    return {
+        CREEP: f"slow relaxation (creep) with a time constant of {term.parameter:.2g} s",
+        MODE: f"a light mode at {term.parameter:.3g} Hz",
+        BACKLASH: f"backlash of ±{(size or 0.0) / NANOMETRE_M:.3g} nm",
+        FRICTION: f"friction that drags by ±{(size or 0.0) / NANOMETRE_M:.3g} nm and slides "
+        f"after {term.parameter / MICROMETRE_M:.2g} µm",
+        STIFFENING: "a stiffness that grows with the deflection",
+        LINEARITY: f"the probe's scale changes over its range, by{nanometres[3:]} at its ends",
+        PERIODIC: f"an error{nanometres} periodic in "
+        f"{term.parameter / MICROMETRE_M:.3g} µm of travel",
+        VIBRATION: f"vibration{nanometres} at {term.parameter:.4g} Hz",
+        DRIFT: f"drift{nanometres} rms during the test",
+    }[term.family]
+
+
+def _unmodelled(judged: Judged) -> str:
+    size = float(np.linalg.norm(judged.score.size))
+    return (
+        f"the residual shows {_words(judged.term, size)} (probability by chance "
+        f"{np.exp(max(judged.log_p, -690)):.1g}) that no model describes: "
+        f"{_REMEDY[judged.term.family]}, and repeat the test"
+    )
+
+
+def independence(p_value: float) -> Finding:
+    """Reject a residual that follows the rate of the motion, see ``residual_tests``."""
+    reasons: tuple[str, ...] = ()
+    if p_value < FALSE_ALARM:
+        reasons = (
+            f"the residual follows the motion (probability by chance {p_value:.1g}): the machine "
+            "does not answer linearly, or differently each time; look for what is loose or rubs, "
+            "and compare with smaller steps",
+        )
+    return Finding({"independence_p": p_value}, {"independence_p_least": FALSE_ALARM}, reasons)
+
+
+def agreement(problem: Problem, best: Fit, up_to: float) -> Finding:
+    """Reject a response that one estimated without a model contradicts, 0 to ``up_to`` [Hz]."""
+    residual = problem.on_grid(best.residual, 0.0)
+    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
+    value = response_agreement(
+        frequency_response(problem.input, residual, problem.period, max(segment, 16)), up_to
+    )
+    if not np.isfinite(value):
+        return Finding({"nonparametric_agreement": None})
+    reasons: tuple[str, ...] = ()
+    if value > _WORST_AGREEMENT:
+        reasons = (
+            f"the response estimated without a model differs from the model by {value:.1f} times "
+            f"its variance, at most {_WORST_AGREEMENT:g} are chance: the model misses a part of "
+            "the machine; make more steps of two heights, and look for what is loose",
+        )
+    return Finding(
+        {"nonparametric_agreement": value}, {"agreement_greatest": _WORST_AGREEMENT}, reasons
+    )

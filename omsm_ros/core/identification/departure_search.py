@@ -1,0 +1,185 @@
+"""Model what the residual shows, one departure after the other, while it shows any.
+
+A slow relaxation or a soft mode becomes a pole; what adds to the reading whatever G is
+(backlash, friction, drift, a line of vibration …) becomes columns beside it. What two slow
+families explain about equally well is fitted together, so that neither takes the other's part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
+from omsm_ros.core.fitting.output_error import Fit, Problem, fit
+from omsm_ros.core.fitting.preparation import Prepared
+from omsm_ros.core.identification.departure_survey import Judged, Survey
+from omsm_ros.core.identification.departures import (
+    BACKLASH,
+    CREEP,
+    DRIFT,
+    FRICTION,
+    LINEARITY,
+    MODE,
+    PERIODIC,
+    VIBRATION,
+    Term,
+)
+from omsm_ros.core.identification.model_choice import Model
+
+_MOST_ROUNDS = 6
+_BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
+_SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
+# Odds below which the data do not choose, as a logarithm (Kass and Raftery 1995: very strong).
+_UNDECIDED = 5.0
+# A decay slower than the record is a drift.
+_LEAST_DECAYS = 1.0
+# Two time constants a decade apart look much the same: the fit starts at several.
+_FASTER = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelledTerm:
+    """A departure with columns of its own in the background, at ``columns``."""
+
+    term: Term
+    columns: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What was fitted in the end.
+
+    beside: departures in the background;  in_response: those that became poles
+    unmodelled: shown by the residual, and not to be had;  survey: of the last fit
+    """
+
+    prepared: Prepared
+    model: Model
+    survey: Survey
+    beside: Sequence[ModelledTerm] = ()
+    in_response: Sequence[Term] = ()
+    unmodelled: Sequence[Judged] = ()
+
+
+Choose = Callable[[Prepared], tuple[Prepared, Model]]
+
+
+def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Searched:
+    """Add departures to the problem or to the model until the residual shows no more.
+
+    choose: fits a prepared problem anew;  may_grow: poles may be added to the model
+    """
+    prepared, beside = _with_columns(prepared, _drift(prepared))
+    prepared, model = choose(prepared)
+    grown: list[Term] = []
+    refused: set[str] = set() if may_grow else {CREEP, MODE}
+    for _ in range(_MOST_ROUNDS):
+        survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+        shown = survey.significant(refused)
+        columns = _beside(survey, shown)
+        if not shown:
+            break
+        if columns:
+            prepared, added = _with_columns(prepared, columns, beside)
+            beside += added
+            prepared, model = choose(prepared)
+            grown = []
+        else:
+            problem = prepared.problem
+            if shown[0].term.family == CREEP:
+                # What is slower than the record has not settled when a period begins anew.
+                problem = replace(problem, fits_initial_condition=True)
+            larger = _grown(problem, model, shown[0].term)
+            if larger is None:
+                refused.add(shown[0].term.family)
+            else:
+                prepared = replace(prepared, problem=problem)
+                model = replace(model, chosen=larger, candidates=[*model.candidates, larger])
+                grown.append(shown[0].term)
+    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+    return Searched(prepared, model, survey, beside, grown, survey.significant())
+
+
+def _drift(prepared: Prepared) -> list[Judged]:
+    """Drift, if it shows before any model does: a model would take it for a slow pole."""
+    problem = prepared.problem
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    survey = Survey(problem, lag, prepared.steps, (CREEP, DRIFT))
+    return [
+        judged for judged in _beside(survey, survey.significant()) if judged.term.family == DRIFT
+    ]
+
+
+def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
+    """Those to be fitted in the background now: the clearest, and its equals among the slow."""
+    if not shown:
+        return []
+    first = shown[0]
+    equals = [
+        other
+        for other in shown[1:]
+        if {first.term.family, other.term.family} <= _SLOW
+        and survey.evidence(other) > survey.evidence(first) - _UNDECIDED
+    ]
+    return [judged for judged in (first, *equals) if judged.term.family in _BESIDE]
+
+
+def _with_columns(
+    prepared: Prepared, shown: Sequence[Judged], before: Sequence[ModelledTerm] = ()
+) -> tuple[Prepared, list[ModelledTerm]]:
+    background = prepared.problem.background
+    added = []
+    drifts = [b.columns.stop - b.columns.start for b in before if b.term.family == DRIFT]
+    for judged in shown:
+        start = background.shape[1]
+        # Of a drift that needs more terms the first are there already.
+        known = sum(drifts) if judged.term.family == DRIFT else 0
+        background = np.column_stack([background, judged.term.columns[:, known:]])
+        added.append(ModelledTerm(judged.term, slice(start, background.shape[1])))
+    problem = replace(prepared.problem, background=background)
+    return replace(prepared, problem=problem), added
+
+
+def _grown(problem: Problem, model: Model, term: Term) -> Candidate | None:
+    """The chosen fit with the poles of ``term``, or None where that describes nothing better."""
+    if term.family not in (CREEP, MODE):
+        return None
+    before = model.chosen.fit
+    new = _poles(term)
+    structure = before.structure
+    larger = Structure(structure.poles + len(new), structure.zeros + len(new), structure.delay)
+    if larger.poles > MAX_POLES:
+        return None
+    scaled = Scaled(larger, problem.rate)
+    delay = float(before.nonlinear[-1]) if structure.delay else 0.0
+    own = before.dynamics.poles()
+    starts = [
+        scaled.nonlinear_of(_scaled([own, faster * new], problem.rate), delay)
+        for faster in (_FASTER if term.family == CREEP else (1.0,))
+    ]
+    found = fit(problem, larger, starts)
+    better = information(found) < information(before)
+    return Candidate(found, information(found)) if better and _decays(found, problem) else None
+
+
+def _scaled(poles: Sequence[ComplexArray], rate: float) -> ComplexArray:
+    return np.asarray(np.concatenate(poles) / rate, np.complex128)
+
+
+def _poles(term: Term) -> ComplexArray:
+    if term.family == CREEP:
+        return np.array([-1 / term.parameter], np.complex128)
+    omega = 2 * np.pi * term.parameter
+    upper = omega * (-term.damping + 1j * np.sqrt(1 - term.damping**2))
+    return np.array([upper, np.conj(upper)], np.complex128)
+
+
+def _decays(found: Fit, problem: Problem) -> bool:
+    """True if every pole of ``found`` forgets within the record."""
+    slowest = float(np.min(-found.dynamics.poles().real))
+    return slowest * len(problem.input) * problem.period > _LEAST_DECAYS

@@ -1,0 +1,268 @@
+"""In which ways may a machine depart from a linear, steady G(s), and how would it look?
+
+Each family gives columns (n, c) of what the probe would see of it, per unit of its size:
+metres for errors of position, participation for what is slow or soft.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy import fft, signal
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.steps import Steps, backlash_columns
+from omsm_ros.core.samples.blocks import FloatArray
+
+CREEP, MODE = "creep", "soft mode"
+BACKLASH, FRICTION = "backlash", "friction"
+STIFFENING, LINEARITY, PERIODIC = "stiffening", "probe linearity", "periodic probe error"
+VIBRATION, DRIFT = "vibration", "drift"
+
+# Below this a relaxation is no slower than the structure itself.
+FASTEST_CREEP_S = 20e-3
+_CREEPS_A_DECADE = 5
+# A line of damping ζ is 2ζ wide, and so far apart are neighbours.
+_DAMPINGS = (0.03, 0.15)
+_FASTEST_MODE_HZ = 100.0
+# Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
+_SLIDING_TRAVELS_M = (0.05e-6, 0.3e-6, 1e-6, 3e-6, 10e-6)
+# What gives way over less is a gap, not a drag.
+_BACKLASH_TRAVEL_M = 0.1e-6
+_MOST_CYCLES = 100
+_DRIFT_DEGREES = (2, 3, 4, 6, 8)
+_LINES_TRIED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One way to depart.
+
+    parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
+    trials: how many independent ones its family tries, for the probability of the best
+    damping: of a mode, else 0
+    columns: (n, c) of what the probe sees per unit
+    """
+
+    family: str
+    parameter: float
+    trials: float
+    columns: FloatArray
+    damping: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Terms of one kind, side by side: ``columns`` (n, terms · c)."""
+
+    name: str
+    parameters: FloatArray
+    trials: float
+    columns: FloatArray
+    dampings: FloatArray | None = None
+
+    @property
+    def width(self) -> int:
+        """Columns of one term."""
+        return int(self.columns.shape[1] // len(self.parameters))
+
+    def term(self, index: int) -> Term:
+        """The term at ``index``."""
+        part = slice(index * self.width, (index + 1) * self.width)
+        name = self.name
+        if name == FRICTION and self.parameters[index] <= _BACKLASH_TRAVEL_M:
+            name = BACKLASH
+        damping = 0.0 if self.dampings is None else float(self.dampings[index])
+        parameter = float(self.parameters[index])
+        return Term(name, parameter, self.trials, self.columns[:, part], damping)
+
+
+@dataclass(frozen=True, eq=False)
+class Departures:
+    """All families for the fit ``fitted`` of ``problem``."""
+
+    problem: Problem
+    fitted: Fit
+    steps: Steps
+
+    def families(self, only: Collection[str] = ()) -> Iterator[Family]:
+        """Those that this motion could show at all, or of them those named."""
+        makers: dict[str, Callable[[], Iterator[Family]]] = {
+            CREEP: lambda: iter([self.creep()]),
+            MODE: lambda: iter([self.modes()]),
+            VIBRATION: lambda: iter([self.vibration()]),
+            DRIFT: self.drift,
+            LINEARITY: lambda: iter([self.linearity()]),
+            STIFFENING: lambda: iter([self.stiffening()]),
+            PERIODIC: lambda: iter([self.periodic()]),
+            FRICTION: self.friction,
+            BACKLASH: self.backlash,
+        }
+        for name, make in makers.items():
+            if not only or name in only:
+                yield from make()
+
+    @property
+    def duration(self) -> float:
+        """Of the record [s]."""
+        return len(self.problem.input) * self.problem.period
+
+    def _in_time(self, spectra: ComplexArray) -> FloatArray:
+        back = fft.irfft(spectra, self.problem.closed_length, axis=-1)
+        return np.asarray(back[..., : len(self.problem.input)].T)
+
+    @property
+    def _answer(self) -> ComplexArray:
+        """Spectrum of what the motion gave, at ``problem.s``."""
+        return self.problem.answer(self.fitted)
+
+    def time_constants(self) -> FloatArray:
+        """Of relaxations that this record can tell from rest: up to its own length [s]."""
+        slowest = max(self.duration, 2 * FASTEST_CREEP_S)
+        decades = np.log10(slowest / FASTEST_CREEP_S)
+        return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
+
+    def creep(self) -> Family:
+        """``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
+
+        In time and from rest: a relaxation longer than the record remembers how it began.
+        """
+        found, columns = self.time_constants(), []
+        answer = self._in_time(self._answer)
+        for time_constant in found:
+            once = relaxed(answer, self.problem.period / time_constant)
+            columns += [once - answer, relaxed(once, self.problem.period / time_constant) - once]
+        return Family(CREEP, found, 3.0, np.column_stack(columns))
+
+    def modes(self) -> Family:
+        """``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a."""
+        lowest = 2 / self.duration
+        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, _FASTEST_MODE_HZ)
+        ladder = [
+            (frequency, damping)
+            for damping in _DAMPINGS
+            for frequency in _geometric(lowest, max(highest, 2 * lowest), 2 * damping)
+        ]
+        frequencies, dampings = np.array(ladder).T
+        omega = 2 * np.pi * frequencies[:, np.newaxis]
+        s = self.problem.s * self.problem.rate / omega
+        mode = self._answer / (1 + 2 * dampings[:, np.newaxis] * s + s * s)
+        spectra = np.stack([mode - self._answer, s * mode], axis=1).reshape(-1, s.shape[1])
+        columns = self._in_time(spectra)
+        return Family(MODE, frequencies, len(ladder) / 2, columns, dampings)
+
+    def vibration(self) -> Family:
+        """Sine and cosine at the strongest lines of the residual."""
+        used = self.problem.used
+        samples = len(used)
+        left = np.zeros(samples)
+        left[used] = self.fitted.residual
+        length = 4 * fft.next_fast_len(samples, real=True)
+        power = np.abs(fft.rfft(left, length)) ** 2
+        # The slowest lines are drift.
+        power[: 4 * 4] = 0.0
+        time = np.arange(samples) * self.problem.period
+        found = []
+        for _ in range(_LINES_TRIED):
+            peak = int(np.argmax(power))
+            found.append(peak / (length * self.problem.period))
+            power[max(peak - 8, 0) : peak + 9] = 0.0
+        angles = 2 * np.pi * np.asarray(found) * time[:, np.newaxis]
+        columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(samples, -1)
+        return Family(VIBRATION, np.asarray(found), samples / 2, columns)
+
+    def drift(self) -> Iterator[Family]:
+        """What wanders slowly, whatever the axis does: polynomials of time beyond the first."""
+        time = np.linspace(-1.0, 1.0, len(self.problem.input))
+        columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
+        for degree in _DRIFT_DEGREES:
+            scale = np.full(1, self.duration / degree)
+            yield Family(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
+
+    def linearity(self) -> Family:
+        """Square and cube of the place of the axis in its travel: a probe that is not linear."""
+        place = self._place
+        columns = np.column_stack([place**2, place**3])
+        return Family(LINEARITY, np.zeros(1), 1.0, columns)
+
+    @property
+    def _place(self) -> FloatArray:
+        motion = self.problem.input
+        middle = 0.5 * (motion.max() + motion.min())
+        return np.asarray((motion - middle) / (0.5 * np.ptp(motion) or 1.0))
+
+    def stiffening(self) -> Family:
+        """Cube of the deflection, the motion seen less the motion made, per its largest."""
+        answer = self._in_time(self._answer)
+        deflection = answer / self.fitted.gain - self.problem.input
+        deflection = deflection - np.median(deflection)
+        largest = float(np.max(np.abs(deflection))) or 1.0
+        return Family(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
+
+    def periodic(self) -> Family:
+        """Sines of the place of the axis, from the whole travel to a fraction of it."""
+        answer = self._in_time(self._answer) / self.fitted.gain
+        travel = float(np.ptp(answer)) or 1.0
+        cycles = np.arange(3, _MOST_CYCLES, dtype=np.float64)
+        angles = 2 * np.pi * answer[:, np.newaxis] / travel * cycles
+        columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(len(answer), -1)
+        return Family(PERIODIC, np.asarray(travel / cycles), float(len(cycles)), columns)
+
+    def friction(self) -> Iterator[Family]:
+        """Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
+        if not self.steps.edges:
+            return
+        moved = _without_noise(self.problem.input, self.steps)
+        columns = [c for travel in _SLIDING_TRAVELS_M for c in dahl(moved, travel)]
+        gain = self.fitted.gain
+        yield Family(
+            FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, -gain * np.column_stack(columns)
+        )
+
+    def backlash(self) -> Iterator[Family]:
+        """Half of the backlash, against the direction of the last move."""
+        columns = backlash_columns(self.steps, len(self.problem.input))
+        if columns.shape[1]:
+            yield Family(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+
+
+def _geometric(low: float, high: float, step: float) -> FloatArray:
+    return np.geomspace(low, high, int(np.log(high / low) / step) + 1)
+
+
+def _without_noise(motion: FloatArray, steps: Steps) -> FloatArray:
+    """``motion`` (n,) that stays where the axis rests, so that noise is no path."""
+    change = np.where(steps.moving[1:] & steps.moving[:-1], np.diff(motion), 0.0)
+    return np.concatenate([[0.0], np.cumsum(change)])
+
+
+def relaxed(values: FloatArray, step: float) -> FloatArray:
+    """``values`` (n,) through 1 / (1 + sτ), at rest before; ``step`` is a sample period over τ.
+
+    The values run straight from sample to sample.
+    """
+    kept = np.exp(-step)
+    mean = (1 - kept) / step
+    rest = values - values[0]
+    filtered = signal.lfilter([1 - mean, mean - kept], [1.0, -kept], rest)
+    return np.asarray(filtered + values[0])
+
+
+def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
+    """Friction force between -1 and 1 along ``motion`` (n,), and what is left of its start.
+
+    dF/dx = (1 - F sgn v) / travel.
+    """
+    change = np.diff(motion, prepend=motion[0])
+    kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
+    force, value = np.zeros(len(motion)), 0.0
+    for index in np.flatnonzero(change):
+        value = direction[index] + (value - direction[index]) * kept[index]
+        force[index] = value
+    moved = change != 0
+    last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
+    return force[last], np.cumprod(kept)

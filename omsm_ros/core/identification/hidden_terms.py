@@ -1,0 +1,226 @@
+"""What could hide in this very test, and how much would it cost on a scan?
+
+A term that the residual does not show may still be there, up to a size at which it would
+have been seen. Leaving it out shifts the fitted coefficients by what they imitate of it.
+Its size is known as N(estimate, uncertainty²), so the mean square of what is left out is
+estimate² + uncertainty²: that much is added to the covariance, unless the user declares
+a smaller prior.
+
+Of a slow relaxation G(0) = 1 alone knows: everything faster is off by its size ε. That is
+a variance of the whole numerator; only slower than ``valid_from`` is the gain one again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import stats
+
+from omsm_ros.core.dynamics.response_band import relative_response_jacobian
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.least_squares import least_squares
+from omsm_ros.core.fitting.output_error import Fit
+from omsm_ros.core.identification.covariance_terms import CovarianceTerm
+from omsm_ros.core.identification.departure_survey import FALSE_ALARM, Judged, Survey
+from omsm_ros.core.identification.departures import CREEP, FASTEST_CREEP_S, MODE, STIFFENING
+from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+
+# Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
+# area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
+PAPER_SCAN = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
+# A test that alarms with probability α misses with 5 % what lies 1.645 σ above its limit.
+_POWER = 1.645
+# The families whose omission bends the response itself.
+_BENDING = (MODE, STIFFENING)
+# Decades of time between a structure's slowest motion and the length of a record.
+_DECADES = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTerm:
+    """One family that could hide.
+
+    size, uncertainty: of the term that the residual shows most, in its unit
+    missed: largest size that the test would have missed with 5 % probability
+    shift: (p,) of the coefficients per unit, if the term is left out
+    gain: (p,) change of the coefficients that scales the whole response by one
+    above: relative error of the response at all frequencies above ``valid_from``, per unit
+    effect: rms error on the paper's scan per unit [m]
+    """
+
+    family: str
+    parameter: float
+    size: float
+    uncertainty: float
+    missed: float
+    shift: FloatArray
+    gain: FloatArray
+    above: float
+    effect: float
+
+    @property
+    def carried(self) -> float:
+        """Standard uncertainty of the size that is left out."""
+        return float(np.hypot(self.size, self.uncertainty))
+
+    def covariance(self, carried: float) -> FloatArray:
+        """(p, p), of the coefficients, for a standard uncertainty ``carried`` of the size."""
+        rows = carried * np.stack([self.shift, self.above * self.gain])
+        return np.asarray(rows.T @ rows)
+
+
+def hidden_terms(survey: Survey) -> list[HiddenTerm]:
+    """Return what could hide: the worst relaxation first, then the families that bend G."""
+    relaxations = [_hidden(survey, judged) for judged in survey.creep]
+    told = [term for term in relaxations if np.isfinite(term.uncertainty)]
+    found = [_worst(told, relaxation_found(survey.fitted.dynamics))] if told else []
+    for name in _BENDING:
+        judged = survey.best.get(name)
+        if judged is not None and np.isfinite(judged.score.uncertainty) and _told(survey, judged):
+            found.append(_hidden(survey, judged))
+    return found
+
+
+def _worst(relaxations: list[HiddenTerm], found: float) -> HiddenTerm:
+    """The relaxation that would cost most, where some is found no larger than likely.
+
+    found: size of what is in the model already. Creep of joints and of piezos goes about
+    evenly with the logarithm of time; what lies in the other decades of the record is not
+    more than a few times what was found, and a larger one only the model's own imitates.
+    """
+    if found > 0:
+        limit = _DECADES * found
+        relaxations = [
+            replace(term, size=min(term.size, limit), uncertainty=min(term.uncertainty, limit))
+            for term in relaxations
+        ]
+    return max(relaxations, key=lambda term: term.effect * term.carried)
+
+
+def relaxation_found(dynamics: TransferFunction) -> float:
+    """Share of the response at rest that comes with real poles slower than a structure's [1]."""
+    poles = dynamics.poles()
+    found = 0.0
+    for index, pole in enumerate(poles):
+        if pole.imag == 0 and -pole.real * FASTEST_CREEP_S < 1:
+            others = np.delete(poles, index)
+            share = polynomial.polyval(pole, dynamics.numerator) / np.prod(1 - pole / others)
+            found += abs(float(np.real(share)))
+    return found
+
+
+def _told(survey: Survey, judged: Judged) -> bool:
+    """False for a mode slower than the steps follow each other, which the test hardly shows."""
+    return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
+
+
+def hidden_covariance(survey: Survey, settings: Mapping[str, object]) -> list[CovarianceTerm]:
+    """Return the terms of the covariance, each with its entry for the certificate.
+
+    settings: with "priors", an object of standard uncertainties by the name of a family, a
+        term is taken no larger than its prior
+
+    Raises ConfigurationError for a prior that is no positive number.
+    """
+    priors = _priors(settings)
+    terms = hidden_terms(survey)
+    entries = [_entry(term, priors) for term in terms]
+    covariance = [term.covariance(_carried(term, priors)) for term in terms]
+    finding = Finding({"could_hide": entries, "assumed": _assumptions(survey)})
+    return [CovarianceTerm(c) for c in covariance] + [
+        CovarianceTerm(np.zeros((_size(survey.fitted),) * 2), finding)
+    ]
+
+
+def _size(fitted: Fit) -> int:
+    return len(fitted.dynamics.numerator) + len(fitted.dynamics.denominator)
+
+
+def _priors(settings: Mapping[str, object]) -> dict[str, float]:
+    stated = settings.get("priors", {})
+    if not isinstance(stated, Mapping):
+        raise ConfigurationError(f"settings: priors is {stated!r}, expected an object")
+    for name, value in stated.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise ConfigurationError(
+                f"settings: the prior of {name!r} is {value!r}, expected a positive number"
+            )
+    return {str(name): float(value) for name, value in stated.items()}
+
+
+def _carried(term: HiddenTerm, priors: Mapping[str, float]) -> float:
+    return min(term.carried, priors.get(term.family, np.inf))
+
+
+def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
+    carried = _carried(term, priors)
+    return {
+        "family": term.family,
+        "parameter": term.parameter,
+        "size": term.size,
+        "uncertainty": term.uncertainty,
+        "missed": term.missed,
+        "carried": carried,
+        "prior": priors.get(term.family),
+        "effect_on_scan_m": term.effect * carried,
+        "missed_effect_on_scan_m": term.effect * term.missed,
+    }
+
+
+def _assumptions(survey: Survey) -> list[str]:
+    slowest = survey.slowest_creep
+    return [
+        f"no relaxation slower than {slowest:.3g} s, the length of the record",
+        f"no mode below {1 / survey.plateau:.2g} Hz, the rate of the steps",
+    ]
+
+
+def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
+    fitted, term, score = survey.fitted, judged.term, judged.score
+    shift = omitted(survey, term.columns[:, 0])
+    frequency, rms = np.array(PAPER_SCAN).T
+    imitated = _relative(fitted, frequency, shift)
+    left = imitated - _departure(term.family, term.parameter, term.damping, frequency)
+    above = float(np.max(np.abs(left))) if term.family == CREEP else 0.0
+    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, max(score.degrees, 1)))
+    return HiddenTerm(
+        term.family,
+        term.parameter,
+        float(score.size[0]),
+        score.uncertainty,
+        float(limit + _POWER) * score.uncertainty,
+        np.zeros_like(shift) if term.family == CREEP else shift,
+        np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))]),
+        above,
+        float(np.sqrt(np.sum((np.abs(left) * rms) ** 2))),
+    )
+
+
+def _departure(family: str, parameter: float, damping: float, frequency: FloatArray) -> FloatArray:
+    """Relative departure of the response at ``frequency`` (k,) [Hz] per unit, complex (k,)."""
+    s = 2j * np.pi * frequency
+    if family == CREEP:
+        return np.asarray(-s * parameter / (1 + s * parameter))
+    if family == MODE:
+        s = s / (2 * np.pi * parameter)
+        return np.asarray(1 / (1 + 2 * damping * s + s * s) - 1)
+    return np.zeros(len(frequency), np.complex128)
+
+
+def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArray:
+    real, imaginary = relative_response_jacobian(fitted.dynamics, frequency) @ shift
+    return np.asarray(real + 1j * imaginary)
+
+
+def omitted(survey: Survey, column: FloatArray) -> FloatArray:
+    """Shift (p,) of the coefficients of G if a term that adds ``column`` (n,) is left out."""
+    fitted, problem = survey.fitted, survey.problem
+    columns = problem.sensitivity(fitted)
+    solved = least_squares(columns, column[problem.used], 1e-9)
+    size = fitted.structure.size
+    return np.asarray(fitted.scaled.coefficient_jacobian(fitted.nonlinear) @ solved[:size])

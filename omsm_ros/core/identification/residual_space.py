@@ -1,0 +1,144 @@
+"""How much of a residual would one more term explain, and how large a term would it not show?
+
+A score test (Rao 1948): the term's column is freed of everything that the fitted parameters
+could imitate, and the residual is projected on what is left. The variance is that of the
+residual's own spectrum *without* the term, so that a term does not hide behind the noise
+that it makes itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import fft, stats
+
+from omsm_ros.core.fitting.covariance import noise_spectrum
+from omsm_ros.core.fitting.least_squares import orthonormal
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
+
+# Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
+_IMITATED = 1e-4
+# Directions this much weaker than the strongest are rounding.
+_SPANNED = 1e-9
+# Noise is averaged over at least this many lines: its level is then known to a quarter.
+_LEAST_LINES = 8
+# and over half an octave on either side where the lines are dense.
+_HALF_WIDTH = 2**0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What the residual says of one term.
+
+    size: its coefficients (c,), and covariance (c, c) of them
+    chi_square: that they are zero;  degrees: how many could be told from the fit
+    """
+
+    size: FloatArray
+    covariance: FloatArray
+    chi_square: float
+    degrees: int
+
+    @property
+    def log_p(self) -> float:
+        """Natural logarithm of the probability of ``chi_square`` if the term is absent."""
+        return float(stats.chi2.logsf(self.chi_square, self.degrees)) if self.degrees else 0.0
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard uncertainty of the first coefficient; infinite where nothing tells it."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSpace:
+    """The residual of ``fitted`` and what its parameters can imitate."""
+
+    problem: Problem
+    fitted: Fit
+
+    @cached_property
+    def _basis(self) -> FloatArray:
+        return orthonormal(self.problem.sensitivity(self.fitted), _SPANNED)
+
+    def freed(self, columns: FloatArray) -> FloatArray:
+        """``columns`` (n, c) where compared, less what the fit imitates of them, (k, c)."""
+        compared = columns[self.problem.used]
+        return np.asarray(compared - self._basis @ (self._basis.T @ compared))
+
+    def screen(self, columns: FloatArray, terms: int) -> FloatArray:
+        """χ² of each group of ``terms`` neighbouring columns of (n, c), as if noise were white.
+
+        To find the best of many; :meth:`score` then judges it.
+        """
+        compared = columns[self.problem.used]
+        imitated = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
+        moment = (compared.T @ self.fitted.residual).reshape(-1, terms)
+        gram = np.empty((len(moment), terms, terms))
+        for i in range(terms):
+            for j in range(i + 1):
+                both = np.einsum("kg,kg->g", compared[:, i::terms], compared[:, j::terms])
+                both -= np.einsum("kg,kg->g", imitated[..., i], imitated[..., j])
+                gram[:, i, j] = gram[:, j, i] = both
+        inverse = np.linalg.pinv(gram, rcond=_IMITATED, hermitian=True)
+        explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)
+        return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
+
+    def score(self, columns: FloatArray) -> Score:
+        """Judge the term of ``columns`` (n, c), all its coefficients together."""
+        compared = columns[self.problem.used]
+        freed = self.freed(columns)
+        before = np.linalg.norm(compared, axis=0)
+        told = np.linalg.norm(freed, axis=0) > _IMITATED * np.where(before > 0, before, 1.0)
+        terms = columns.shape[1]
+        size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
+        if not np.any(told):
+            return Score(size, covariance, 0.0, 0)
+        unit = np.linalg.norm(freed[:, told], axis=0)
+        inverse = np.linalg.pinv(freed[:, told] / unit, rcond=_IMITATED)
+        found = inverse @ self.fitted.residual
+        left = self.fitted.residual - freed[:, told] / unit @ found
+        spread = self._covariance(inverse, left)
+        chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
+        size[told] = found / unit
+        covariance[np.ix_(told, told)] = spread / np.outer(unit, unit)
+        degrees = int(np.linalg.matrix_rank(inverse, tol=None))
+        return Score(size, covariance, chi_square, degrees)
+
+    def _covariance(self, inverse: FloatArray, left: FloatArray) -> FloatArray:
+        """Covariance (c, c) of ``inverse`` (c, k) times noise of the spectrum of ``left`` (k,)."""
+        used = self.problem.used
+        length = fft.next_fast_len(len(used), real=True)
+        rows = np.zeros((len(inverse), len(used)))
+        rows[:, used] = inverse
+        spectrum = fft.rfft(rows, length, axis=1)
+        weight = np.full(spectrum.shape[1], 2.0)
+        weight[0] = 1.0
+        if length % 2 == 0:
+            weight[-1] = 1.0
+        noise = broad_noise(left, np.flatnonzero(used), len(used), length)
+        lost = self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
+        return np.asarray(np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length)
+
+
+def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
+    """Variance spectrum of ``left`` (k,) at ``length`` // 2 + 1 frequencies; white is flat.
+
+    place: index of each among ``samples``
+    The larger of an autoregressive one, which knows no slow wander, and of the periodogram
+    smoothed over an octave, which does.
+    """
+    on_grid = np.zeros(samples)
+    on_grid[place] = left
+    power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(left)
+    line = np.arange(len(power))
+    low = np.minimum(line / _HALF_WIDTH, line - _LEAST_LINES / 2).astype(int)
+    low = np.clip(low, 1, max(len(power) - _LEAST_LINES, 1))
+    high = np.maximum(line * _HALF_WIDTH, low + _LEAST_LINES).astype(int)
+    high = np.minimum(high, len(power))
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    smooth = (total[high] - total[low]) / np.maximum(high - low, 1)
+    return np.asarray(np.maximum(smooth, noise_spectrum(left, length)))
