@@ -78,30 +78,25 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
     prepared, model = choose(prepared)
     grown: list[Term] = []
     refused: set[str] = set() if may_grow else {CREEP, MODE}
+    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
-        survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
         shown = survey.significant(refused)
-        columns = _beside(survey, shown)
         if not shown:
             break
+        columns = _beside(survey, shown)
         if columns:
             prepared, added = _with_columns(prepared, columns, beside)
             beside += added
             prepared, model = choose(prepared)
             grown = []
         else:
-            problem = prepared.problem
-            if shown[0].term.family == CREEP:
-                # What is slower than the record has not settled when a period begins anew.
-                problem = replace(problem, fits_initial_condition=True)
-            larger = _grown(problem, model, shown[0].term)
+            larger = _grown(prepared, model, shown[0].term)
             if larger is None:
                 refused.add(shown[0].term.family)
-            else:
-                prepared = replace(prepared, problem=problem)
-                model = replace(model, chosen=larger, candidates=[*model.candidates, larger])
-                grown.append(shown[0].term)
-    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+                continue
+            prepared, model = larger
+            grown.append(shown[0].term)
+        survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     return Searched(prepared, model, survey, beside, grown, survey.significant())
 
 
@@ -145,26 +140,35 @@ def _with_columns(
     return replace(prepared, problem=problem), added
 
 
-def _grown(problem: Problem, model: Model, term: Term) -> Candidate | None:
-    """The chosen fit with the poles of ``term``, or None where that describes nothing better."""
+def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Model] | None:
+    """The model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
         return None
-    before = model.chosen.fit
-    new = _poles(term)
-    structure = before.structure
-    larger = Structure(structure.poles + len(new), structure.zeros + len(new), structure.delay)
+    problem = prepared.problem
+    if term.family == CREEP:
+        # What is slower than the record has not settled when a period begins anew.
+        problem = replace(problem, fits_initial_condition=True)
+    before, new = model.chosen.fit, _poles(term)
+    zeros, delay = before.structure.zeros + len(new), before.structure.delay
+    larger = Structure(before.structure.poles + len(new), zeros, delay)
     if larger.poles > MAX_POLES:
         return None
     scaled = Scaled(larger, problem.rate)
-    delay = float(before.nonlinear[-1]) if structure.delay else 0.0
+    late = float(before.nonlinear[-1]) if delay else 0.0
     own = before.dynamics.poles()
-    starts = [
-        scaled.nonlinear_of(_scaled([own, faster * new], problem.rate), delay)
-        for faster in (_FASTER if term.family == CREEP else (1.0,))
-    ]
-    found = fit(problem, larger, starts)
-    better = information(found) < information(before)
-    return Candidate(found, information(found)) if better and _decays(found, problem) else None
+    found = fit(
+        problem,
+        larger,
+        [
+            scaled.nonlinear_of(_scaled([own, faster * new], problem.rate), late)
+            for faster in (_FASTER if term.family == CREEP else (1.0,))
+        ],
+    )
+    candidate = Candidate(found, information(found))
+    if candidate.bic >= information(before) or not _decays(found, problem):
+        return None
+    grown = replace(model, chosen=candidate, candidates=[*model.candidates, candidate])
+    return replace(prepared, problem=problem), grown
 
 
 def _scaled(poles: Sequence[ComplexArray], rate: float) -> ComplexArray:

@@ -32,7 +32,7 @@ _FASTEST_MODE_HZ = 100.0
 # Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
 _SLIDING_TRAVELS_M = (0.05e-6, 0.3e-6, 1e-6, 3e-6, 10e-6)
 # What gives way over less is a gap, not a drag.
-_BACKLASH_TRAVEL_M = 0.1e-6
+_BACKLASH_TRAVEL_M = 0.3e-6
 _MOST_CYCLES = 100
 _DRIFT_DEGREES = (2, 3, 4, 6, 8)
 _LINES_TRIED = 3

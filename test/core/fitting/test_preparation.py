@@ -48,18 +48,9 @@ def test_after_a_gap_of_the_encoder_the_response_settles_first():
     assert len(prepared.steps.edges) == 19
 
 
-def test_a_bent_drift_gets_its_columns_and_a_straight_one_does_not():
-    straight = prepare(record_of(1e-7 * TIME / TIME[-1]), "encoder")
+def test_only_offset_and_drift_are_fitted_before_any_model():
     bent = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")
-    assert straight.problem.background.shape[1] == 2
-    assert bent.problem.background.shape[1] == 4
-
-
-def test_backlash_gets_its_column():
-    direction = np.where(TIME < 5.5, 20e-9, -20e-9)
-    prepared = prepare(record_of(direction), "encoder")
-    assert prepared.backlash_column is not None
-    assert prepare(record_of(), "encoder").backlash_column is None
+    assert bent.problem.background.shape[1] == 2
 
 
 def test_the_probes_gain_must_be_plausible():

@@ -7,6 +7,8 @@ import pytest
 from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.certificate import certificate_of, verdict
+from omsm_ros.core.identification.departure_search import Searched
+from omsm_ros.core.identification.departure_survey import Survey
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.model_choice import choose_model
@@ -19,13 +21,16 @@ def evidence(step_test):
     record, limits = assemble([step_test.axes], [step_test.distance]), ResponseLimits()
     prepared = prepare(record, "encoder")
     model = choose_model(prepared, 1)
-    return Evidence(record, prepared, model, response_uncertainty(prepared, model, limits), limits)
+    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+    known = response_uncertainty(prepared, model, limits)
+    return Evidence(record, prepared, model, known, limits, Searched(prepared, model, survey))
 
 
-def test_the_verdict_says_how_far():
-    assert verdict([], 80.0, 500.0) == "accepted up to 80 Hz"
-    assert verdict([], 500.0, 500.0) == "accepted"
-    assert verdict(["sharp edges"], 500.0, 500.0) == "rejected"
+def test_the_verdict_says_what_the_data_support():
+    assert verdict([], [], 0.015, 80.0) == "accepted, supported by data from 0.015 to 80 Hz"
+    kept = verdict([], ["creep"], 0.015, 80.0)
+    assert kept == "accepted with reservations, supported by data from 0.015 to 80 Hz"
+    assert verdict(["sharp edges"], ["creep"], 0.015, 80.0) == "rejected"
 
 
 def test_what_every_check_found_stands_in_it(evidence):
