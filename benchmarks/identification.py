@@ -29,6 +29,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.fitting.covariance import hidden_motion_covariance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.step_plan import StepPlan, plan_steps
 from omsm_ros.core.machine.trajectories import Motion, StepTest

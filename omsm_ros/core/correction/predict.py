@@ -133,7 +133,7 @@ def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: f
     digital = discretise(calibration.dynamics, sample_period)
     variance += _missed_beyond(calibration.valid_up_to, digital, z)
     settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(variance) // 4)
-    return np.sqrt(variance[settling:])
+    return np.asarray(np.sqrt(variance[settling:]))
 
 
 def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:

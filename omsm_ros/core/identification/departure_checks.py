@@ -10,12 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omsm_ros.core.dynamics.frequency_response import frequency_response
-from omsm_ros.core.fitting.covariance import parameter_covariance
-from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.identification.departure_search import ModelledTerm, Searched
-from omsm_ros.core.identification.departure_survey import FALSE_ALARM, Judged
-from omsm_ros.core.identification.departures import (
+from omsm_ros.core.departures.families import (
     BACKLASH,
     CREEP,
     DRIFT,
@@ -27,6 +22,11 @@ from omsm_ros.core.identification.departures import (
     VIBRATION,
     Term,
 )
+from omsm_ros.core.departures.survey import FALSE_ALARM, Judged
+from omsm_ros.core.dynamics.frequency_response import frequency_response
+from omsm_ros.core.fitting.covariance import parameter_covariance
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.identification.departure_search import ModelledTerm, Searched
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.residual_tests import response_agreement
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M

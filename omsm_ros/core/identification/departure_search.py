@@ -12,13 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.dynamics.transfer_function import ComplexArray
-from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
-from omsm_ros.core.fitting.output_error import Fit, Problem, fit
-from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.identification.departure_survey import Judged, Survey
-from omsm_ros.core.identification.departures import (
+from omsm_ros.core.departures.families import (
     BACKLASH,
     CREEP,
     DRIFT,
@@ -29,6 +23,12 @@ from omsm_ros.core.identification.departures import (
     VIBRATION,
     Term,
 )
+from omsm_ros.core.departures.survey import Judged, Survey
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
+from omsm_ros.core.fitting.output_error import Fit, Problem, fit
+from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.identification.model_choice import Model
 
 _MOST_ROUNDS = 6

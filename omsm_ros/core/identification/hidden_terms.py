@@ -19,13 +19,13 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import stats
 
+from omsm_ros.core.departures.families import CREEP, FASTEST_CREEP_S, MODE, STIFFENING
+from omsm_ros.core.departures.survey import FALSE_ALARM, Judged, Survey
 from omsm_ros.core.dynamics.response_band import relative_response_jacobian
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
-from omsm_ros.core.identification.departure_survey import FALSE_ALARM, Judged, Survey
-from omsm_ros.core.identification.departures import CREEP, FASTEST_CREEP_S, MODE, STIFFENING
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError

@@ -133,8 +133,10 @@ def verdict_on_calibration(calibration: Calibration) -> Verdict:
         return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
     if not stated:
         return Verdict("unknown", "Not judged", ("the calibration has no certificate",))
+    kept = tables.texts(calibration.certificate, "reservations")
     level = "good" if stated.startswith("accepted") else "unknown"
-    return Verdict(level, stated[:1].upper() + stated[1:], (*reasons, *_grounds(calibration)))
+    grounds = (*reasons, *kept, *_grounds(calibration))
+    return Verdict("care" if kept else level, stated[:1].upper() + stated[1:], grounds)
 
 
 def _grounds(calibration: Calibration) -> list[str]:
@@ -256,6 +258,13 @@ def sections(certificate: CertificatePage) -> list[Section]:
             "Static gain and background",
             (),
             (tables.gain_table(calibration), tables.background_table(entries)),
+        ),
+        Section(
+            "What departs, and what could hide",
+            (),
+            (tables.departure_table(entries), tables.hidden_table(entries)),
+            "A size that would be missed is one that this very test shows with a probability of "
+            "95 %; the band holds what the test leaves open of it.",
         ),
         Section(
             "Records",

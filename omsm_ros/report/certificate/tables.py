@@ -26,6 +26,8 @@ _SHOWN = {
     "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
     "shape", "modal_remainder", "two_mass", "static_gains", "nonparametric_agreement", "samples",
     "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
+    "valid_from", "departures", "could_hide", "assumed", "motion_error_m", "reservations",
+    "noise_covariance",
 }  # fmt: skip
 
 CertificateEntries = Mapping[str, Any]
@@ -190,6 +192,41 @@ def background_table(certificate: CertificateEntries) -> Table:
 
 def _or_none(value: object, unit: str) -> str:
     return "none seen" if number(value) == 0 else quantity(value, unit)
+
+
+def departure_table(certificate: CertificateEntries) -> Table:
+    """What departs from a linear, steady response, and was modelled."""
+    rows = [
+        (
+            str(entry.get("family", NOTHING)),
+            quantity(entry.get("size_m"), "m"),
+            quantity(entry.get("uncertainty_m"), "m"),
+            str(entry.get("modelled", NOTHING)),
+        )
+        for entry in listed(certificate, "departures")
+    ]
+    if rows:
+        together = quantity(certificate.get("motion_error_m"), "m")
+        rows.append(("together, on a height", together, "", ""))
+    return Table("Found beside a steady linear response", ("size", "u", "modelled"), rows)
+
+
+def hidden_table(certificate: CertificateEntries) -> Table:
+    """What this very test would have missed, and what that costs on a scan."""
+    rows = [
+        (
+            str(entry.get("family", NOTHING)),
+            plain(entry.get("missed")),
+            quantity(entry.get("missed_effect_on_scan_m"), "m"),
+            quantity(entry.get("effect_on_scan_m"), "m"),
+        )
+        for entry in listed(certificate, "could_hide")
+    ]
+    return Table(
+        "What could hide",
+        ("largest size missed (95 %)", "of it on the paper's scan", "in the band"),
+        rows + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
+    )
 
 
 def coefficient_table(calibration: Calibration) -> Table:

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
+from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.certificate import certificate_of, verdict
 from omsm_ros.core.identification.departure_search import Searched
-from omsm_ros.core.identification.departure_survey import Survey
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.model_choice import choose_model

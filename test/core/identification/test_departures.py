@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import Problem, fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.departure_checks import agreement, independence
-from omsm_ros.core.identification.departure_search import search
-from omsm_ros.core.identification.departure_survey import Survey
-from omsm_ros.core.identification.departures import (
+from omsm_ros.core.departures.families import (
     CREEP,
     DRIFT,
     MODE,
@@ -20,6 +12,14 @@ from omsm_ros.core.identification.departures import (
     dahl,
     relaxed,
 )
+from omsm_ros.core.departures.survey import Survey
+from omsm_ros.core.dynamics.response_band import response_band
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.output_error import Problem, fit
+from omsm_ros.core.fitting.preparation import prepare
+from omsm_ros.core.identification.departure_checks import agreement, independence
+from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.hidden_terms import hidden_terms, relaxation_found
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start

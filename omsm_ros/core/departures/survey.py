@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from omsm_ros.core.departures.families import Departures, Term
+from omsm_ros.core.departures.residual_space import ResidualSpace, Score
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps
-from omsm_ros.core.identification.departures import Departures, Term
-from omsm_ros.core.identification.residual_space import ResidualSpace, Score
 
 # Probability of a false alarm of one family; ten of them together stay far below two per cent.
 FALSE_ALARM = 1e-4
