@@ -227,6 +227,16 @@ def _order_headline(calibration: Calibration) -> Headline:
     return Headline("Structure", tables.structure_text(known), detail)
 
 
+def _departures(entries: tables.CertificateEntries) -> Section:
+    return Section(
+        "What departs, and what could hide",
+        (),
+        (tables.departure_table(entries), tables.hidden_table(entries)),
+        "A size that would be missed is one that this very test shows with a probability of "
+        "95 %; the band holds what the test leaves open of it.",
+    )
+
+
 def sections(certificate: CertificatePage) -> list[Section]:
     """All parts below the first screen that have anything to show."""
     calibration = certificate.calibration
@@ -259,13 +269,7 @@ def sections(certificate: CertificatePage) -> list[Section]:
             (),
             (tables.gain_table(calibration), tables.background_table(entries)),
         ),
-        Section(
-            "What departs, and what could hide",
-            (),
-            (tables.departure_table(entries), tables.hidden_table(entries)),
-            "A size that would be missed is one that this very test shows with a probability of "
-            "95 %; the band holds what the test leaves open of it.",
-        ),
+        _departures(entries),
         Section(
             "Records",
             (),
