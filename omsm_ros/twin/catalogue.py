@@ -100,7 +100,7 @@ CATALOGUE: dict[str, Sizes] = {
     "creep, 2 s": _creep(2.0),
     "creep, 20 s": _creep(20.0),
     "logarithmic creep": _structure(
-        "log_creep", *(LogCreep(fraction_per_decade=f) for f in (1e-4, 3e-4, 1e-3))
+        "log_creep", *(LogCreep(fraction_per_decade=f) for f in (3e-5, 1e-4, 3e-4))
     ),
     "base mode, 8 Hz": _soft_mode(8.0, 0.02),
     "isolator, 2.5 Hz": _soft_mode(2.5, 0.1),
