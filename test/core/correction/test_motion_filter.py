@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -94,3 +97,32 @@ def test_an_axis_that_is_no_number_splits_the_run() -> None:
 def test_settling_covers_the_lateral_delay_too() -> None:
     filters = MotionFilters.of(CALIBRATION, 1e-3, lateral_lag=80e-3)
     assert filters.settling_samples() > 80
+
+
+def test_however_the_stream_is_cut_the_same_samples_settle() -> None:
+    whole = uniform(0, 300)
+    (at_once,) = new(lateral_lag=0.4e-3).push(whole)
+    cut = new(lateral_lag=0.4e-3)
+    bounds = [0, 5, 13, 14, 40, 41, 60, 200, 300]
+    runs = [run for a, b in pairwise(bounds) for run in cut.push(whole.part(a, b))]
+    assert np.array_equal(np.concatenate([run.reasons for run in runs]), at_once.reasons)
+    assert np.array_equal(np.concatenate([run.values for run in runs], axis=1), at_once.values)
+
+
+def test_variance_of_the_dynamics_is_that_of_the_lag_at_constant_speed() -> None:
+    """An uncertain delay, and an uncertain time constant: v² (σ_τ² + σ_d²)."""
+    covariance = np.zeros((7, 7))
+    covariance[3, 3], covariance[6, 6] = (2e-6) ** 2, (3e-6) ** 2
+    uncertain = replace(CALIBRATION, covariance=covariance)
+    (run,) = MotionFilter(MotionFilters.of(uncertain, 1e-3)).push(uniform(0, 200))
+    expected = SPEED[2] ** 2 * ((2e-6) ** 2 + (3e-6) ** 2)
+    np.testing.assert_allclose(run.values[DYNAMICS], expected, rtol=1e-5)
+
+
+def test_a_run_just_long_enough_to_start_on_is_filtered() -> None:
+    """One sample fewer waits for more; that many come out at once."""
+    enough = next(n for n in range(1, 100) if new().push(uniform(0, n)))
+    motion = new()
+    assert motion.push(uniform(0, enough - 1)) == []
+    assert sum(len(run) for run in motion.push(uniform(enough - 1, 1))) == enough
+    assert motion.pending == 0

@@ -123,3 +123,34 @@ def test_backlash_follows_the_direction_of_approach():
 def test_steps_of_one_direction_say_nothing_of_backlash():
     steps = find_steps(staircase([10e-6, 10e-6]), 1e-3)
     assert backlash_columns(steps, 1200).shape == (1200, 0)
+
+
+def test_four_edges_are_cut_between_and_three_into_equal_parts():
+    heights = [10e-6, 10e-6, -10e-6, -10e-6]
+    steps = find_steps(staircase(heights), 1e-3)
+    assert len(segments(steps, 2000)) == 4
+    few = find_steps(staircase(heights[:3]), 1e-3)
+    parts = segments(few, 1600)
+    assert parts == [(start, start + 200) for start in range(0, 1600, 200)]
+
+
+@pytest.mark.parametrize("cut", ["start", "end"])
+def test_an_edge_cut_by_the_end_of_the_record_is_none(cut):
+    """Its height is not known; the others keep theirs."""
+    z = staircase([10e-6, 5e-6, -8e-6], noise=0.0)
+    part = slice(410, None) if cut == "start" else slice(None, 1210)
+    steps = find_steps(z[part], 1e-3)
+    expected = [5e-6, -8e-6] if cut == "start" else [10e-6, 5e-6]
+    np.testing.assert_allclose([edge.height for edge in steps.edges], expected, atol=1e-9)
+    assert steps.moving[0 if cut == "start" else -1]
+    assert not steps.moving[-1 if cut == "start" else 0]
+
+
+def test_backlash_of_an_edge_begins_with_it():
+    steps = find_steps(staircase([10e-6, -10e-6], noise=0.0), 1e-3)
+    direction, before = backlash_columns(steps, 1200).T
+    first, second = steps.edges
+    assert np.array_equal(before, np.arange(1200) < first.start)
+    assert np.all(direction[: first.start] == 0)
+    assert np.all(direction[first.start : second.start] == 1)
+    assert np.all(direction[second.start :] == -1)

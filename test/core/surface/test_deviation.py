@@ -247,3 +247,13 @@ class TestRunningStatistics:
     def test_nothing_is_no_cloud(self):
         with pytest.raises(DataError, match="0 points"):
             form.RunningStatistics().statistics()
+
+
+def test_areas_count_by_their_ratio_alone():
+    deviation, weights = np.array([1e-9, -2e-9, 4e-9]), np.array([1.0, 2.0, 3.0])
+    expected = form.statistics(deviation, weights)
+    assert form.statistics(deviation, 1e-6 * weights).rms_area_weighted == pytest.approx(
+        expected.rms_area_weighted
+    )
+    by_hand = np.sqrt((1 * 1 + 2 * 4 + 3 * 16) / 6) * 1e-9
+    assert expected.rms_area_weighted == pytest.approx(by_hand)
