@@ -81,4 +81,6 @@ def _row(
     bar: str,
     holds: bool | None,
 ) -> Row:
-    return Row(name=name, value=float(value), unit=unit, runs=runs, peer=peer, bar=bar, holds=holds)
+    # Plain Python, for the table becomes JSON.
+    plain = None if holds is None else bool(holds)
+    return Row(name=name, value=float(value), unit=unit, runs=runs, peer=peer, bar=bar, holds=plain)

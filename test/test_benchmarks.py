@@ -1,5 +1,6 @@
 """The yardsticks themselves: a bound that is one, and shares that count what they say."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from benchmarks.against_truth import band_held, coverage
 from benchmarks.cramer_rao import response_bounds
+from benchmarks.row import at_least, at_most, between, shown
 from omsm_ros.core.dynamics.calibration import REJECTED
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 
@@ -57,6 +59,17 @@ def test_the_bound_is_the_scatter_of_an_efficient_estimate(delay):
     # 2000 draws tell a standard deviation to 1.6 %.
     np.testing.assert_allclose(np.std(errors.real, axis=1), gain, rtol=0.06)
     np.testing.assert_allclose(np.std(errors.imag, axis=1), phase, rtol=0.06)
+
+
+def test_every_row_is_json():
+    rows = [
+        between("x", np.float64(1.0), "nm", np.float64(0.5), np.float64(1.5)),
+        at_most("x", np.float64(1.0), "nm", np.float64(0.5), runs=3),
+        at_least("x", 1.0, "nm", 0.5),
+        shown("x", 1, "nm"),
+    ]
+    back = json.loads(json.dumps(rows))
+    assert [row["holds"] for row in back] == [True, False, True, None]
 
 
 def test_rejected_runs_do_not_count_as_covered():

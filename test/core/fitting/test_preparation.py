@@ -53,24 +53,6 @@ def test_only_offset_and_drift_are_fitted_before_any_model():
     assert bent.problem.background.shape[1] == 2
 
 
-def test_a_bent_drift_is_not_taken_for_backlash_nor_shifts_it():
-    bent, play = 1e-7 * (TIME / TIME[-1]) ** 2, np.where(TIME < 5.5, 20e-9, -20e-9)
-    assert prepare(record_of(bent), "encoder").backlash_column is None
-    prepared = prepare(record_of(bent + play), "encoder")
-    column = prepared.problem.background[:, prepared.backlash_column]
-    assert set(np.unique(column)) == {-1.0, 0.0, 1.0}
-
-
-@pytest.mark.parametrize(("sigmas", "columns"), [(3.5, 2), (8.0, 4)])
-def test_a_drift_is_bent_where_four_sigma_a_column_show_it(sigmas, columns):
-    """Of what a straight drift and the motion cannot explain of it, in units of the noise."""
-    ramp = np.linspace(-1, 1, len(TIME))
-    known = np.column_stack([np.ones(len(TIME)), ramp, STEPS / np.max(STEPS)])
-    bend = ramp**2 - known @ np.linalg.lstsq(known, ramp**2, rcond=None)[0]
-    bend *= sigmas * 1e-8 / np.linalg.norm(bend)
-    assert prepare(record_of(bend), "encoder").problem.background.shape[1] == columns
-
-
 @pytest.mark.parametrize(("share", "expected"), [(0.03, 20.0), (0.003, 2.0)])
 def test_content_is_counted_by_the_energy_of_the_velocity(share, expected):
     """Two sines, of which the faster one has this share of the energy."""
