@@ -1,6 +1,6 @@
 """What a real structure does beside G(s): it creeps, rocks, has backlash, drags and stiffens.
 
-``carriage → G(s) → creep, soft modes → stiffness → backlash → friction → probe``
+``carriage → G(s) → creep, soft modes → stiffness → friction → backlash → probe``
 
 All but creep and soft modes act at once, on the deflection or on the position, so they are as
 fine in time as G's own output is. Not imitated: backlash and friction within the servo loop,
@@ -9,9 +9,7 @@ stiffness that changes the frequency of a mode (it scales the whole deflection),
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy import signal
@@ -20,6 +18,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.machine.trajectories import s_curve
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.hysteresis import backlash, friction
 from omsm_ros.twin.plant import Movement
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.trajectory import Trajectory
@@ -34,8 +33,6 @@ _SHORTEST_RELAXATION_S = 1e-4
 # the straight lines between are then within 1e-4 of what is itself 1e-3 of the motion.
 _LONGEST_SLOW_STEP_S = 0.25e-3
 _SLOW_STEPS = 30
-# A change smaller than this between two steps is rounding, not a reversal [m].
-_STILL_M = 1e-16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,11 +172,12 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
         probe = carriage - (carriage - probe) * (1 + along)
     if errors.hardening_deflection_m is not None:
         probe = carriage - hardened(carriage - probe, errors.hardening_deflection_m)
-    if errors.backlash_m:
-        probe = backlash(probe, errors.backlash_m)
     if errors.friction:
         probe = probe - errors.friction.drag_m * friction(probe, errors.friction.presliding_m)
-    return Movement(moved.carriage, Trajectory(moved.probe.start, moved.probe.step, probe))
+    result = Trajectory(moved.probe.start, moved.probe.step, probe)
+    if errors.backlash_m:
+        result = backlash(result, errors.backlash_m)
+    return Movement(moved.carriage, result)
 
 
 def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
@@ -233,45 +231,3 @@ def hardened(linear: FloatArray, scale: float) -> FloatArray:
     return np.asarray(
         2 * scale / root3 * np.sinh(np.arcsinh(1.5 * root3 * linear / scale) / 3), np.float64
     )
-
-
-def backlash(position: FloatArray, width: float) -> FloatArray:
-    """What follows ``position`` (n,) [m] with lost motion of ``width`` [m], centred at first."""
-    half, state = width / 2, position[0]
-    starts, rising = [], []
-    runs = list(_monotone_runs(position))
-    for _, last, up in runs:
-        starts.append(state)
-        rising.append(up)
-        end = position[last - 1]
-        state = max(state, end - half) if up else min(state, end + half)
-    lengths = [last - first for first, last, _ in runs]
-    start, up_run = np.repeat(starts, lengths), np.repeat(rising, lengths)
-    return np.where(up_run, np.maximum(start, position - half), np.minimum(start, position + half))
-
-
-def friction(position: FloatArray, presliding: float) -> FloatArray:
-    """Dahl's friction, -1 to 1 (n,), along ``position`` (n,) [m], none at first.
-
-    Along a run of one direction s: ``F = s - (s - F₀) exp(-|z - z₀| / presliding)``.
-    """
-    result, state = np.empty_like(position), 0.0
-    for first, last, up in _monotone_runs(position):
-        sign = 1.0 if up else -1.0
-        travel = abs(position[first:last] - position[max(first - 1, 0)])
-        result[first:last] = sign - (sign - state) * np.exp(-travel / presliding)
-        state = result[last - 1]
-    return result
-
-
-def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
-    """Pieces ``first:last`` in which the position only rises (True) or only falls, in order."""
-    change = np.diff(position, prepend=position[0])
-    moving = abs(change) > _STILL_M
-    # At rest the direction is that of the last move.
-    latest = np.maximum.accumulate(np.where(moving, np.arange(len(position)), 0))
-    up = change[latest] > 0
-    cuts = np.flatnonzero(up[1:] != up[:-1]) + 1
-    bounds = [0, *cuts.tolist(), len(position)]
-    for first, last in pairwise(bounds):
-        yield first, last, bool(up[first])

@@ -13,9 +13,7 @@ from omsm_ros.twin.structure import (
     LogCreep,
     SoftMode,
     StructureErrors,
-    backlash,
     deform,
-    friction,
     hardened,
 )
 from omsm_ros.twin.trajectory import Trajectory
@@ -78,52 +76,6 @@ def test_at_rest_nothing_is_added():
     )
     np.testing.assert_allclose(_deformed(errors, np.full(20_000, 3e-6)), 3e-6, atol=1e-18)
     assert abs(errors.response(np.zeros(1, complex)) - 1) < 1e-15
-
-
-def test_the_loop_of_backlash_is_as_wide_as_stated():
-    turn = np.linspace(0, 6 * np.pi, 60_001)
-    position = 1e-6 * np.sin(turn)
-    followed = backlash(position, 60e-9)
-    rising = (turn > 4 * np.pi - 1) & (turn < 4 * np.pi + 1)  # well after a reversal
-    falling = (turn > 5 * np.pi - 1) & (turn < 5 * np.pi + 1)
-    np.testing.assert_allclose(position[rising] - followed[rising], 30e-9, atol=1e-15)
-    np.testing.assert_allclose(position[falling] - followed[falling], -30e-9, atol=1e-15)
-
-
-def _paths():
-    random = np.random.default_rng(3)
-    yield np.cumsum(random.normal(0, 1e-8, 5000))
-    yield np.repeat(np.cumsum(random.normal(0, 1e-8, 500)), 10)  # with rests
-    yield np.zeros(10)
-
-
-@pytest.mark.parametrize("path", list(_paths()), ids=["walk", "with rests", "at rest"])
-def test_backlash_is_the_play_operator_step_by_step(path):
-    state, expected = path[0], []
-    for z in path:
-        state = min(max(state, z - 20e-9), z + 20e-9)
-        expected.append(state)
-    np.testing.assert_allclose(backlash(path, 40e-9), expected, atol=1e-21)
-
-
-@pytest.mark.parametrize("path", list(_paths()), ids=["walk", "with rests", "at rest"])
-def test_friction_obeys_dahls_equation_step_by_step(path):
-    state, expected = 0.0, [0.0]
-    for dz in np.diff(path):
-        sign = np.sign(dz)
-        state = sign - (sign - state) * np.exp(-abs(dz) / 30e-9) if dz else state
-        expected.append(state)
-    np.testing.assert_allclose(friction(path, 30e-9), expected, atol=1e-12)
-
-
-def test_friction_turns_over_within_the_presliding_distance():
-    there = np.linspace(0, 100e-6, 10_001)
-    path = np.r_[there, there[-2::-1]]
-    found = friction(path, 1e-6)
-    assert found[10_000] == pytest.approx(1.0)
-    # One micrometre after the reversal:
-    assert found[10_100] == pytest.approx(-1 + 2 * np.exp(-1), abs=1e-3)
-    assert found[-1] == pytest.approx(-1.0)
 
 
 def test_the_probe_is_held_back_by_the_drag():
