@@ -10,7 +10,15 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).resolve().parent  # --symlink-install runs a link to this file elsewhere
 PACKAGE = "omsm_ros"
 INTERFACES = f"{PACKAGE}.interfaces"
-NODES = ("corrector", "calibrator", "confocal_driver", "recorder", "cell_emulator", "cell_demo")
+NODES = (
+    "corrector",
+    "calibrator",
+    "confocal_driver",
+    "reference_driver",
+    "recorder",
+    "cell_emulator",
+    "cell_demo",
+)
 
 setup(
     name=PACKAGE,

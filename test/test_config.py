@@ -10,7 +10,7 @@ import yaml
 import omsm_ros
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.devices.factory import PARAMETERS
+from omsm_ros.devices import factory
 from omsm_ros.storage.machine_files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
@@ -18,15 +18,20 @@ NO_PARAMETERS = {"paper_mirror", "disturbances"}
 NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PARAMETERS)
 
 
+TABLES = {
+    "confocal_driver": factory.PARAMETERS,
+    "reference_driver": factory.REFERENCE_PARAMETERS,
+}
+
+
 def _declared(node):
+    yield from (entry.name for entry in TABLES.get(node, ()))
     tree = ast.parse((ROOT / "omsm_ros" / "nodes" / f"{node}_node.py").read_text())
     for call in ast.walk(tree):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "parameter":
             name = call.args[1]
             if isinstance(name, ast.Constant):
                 yield name.value
-            elif isinstance(name, ast.Attribute):  # a table's
-                yield from (entry.name for entry in PARAMETERS)
             elif isinstance(name.values[0], ast.Constant):  # f"geometry.{name}"
                 group = {"geometry.": Geometry, "sources.": ErrorSources}[name.values[0].value]
                 yield from (f"{name.values[0].value}{field.name}" for field in fields(group))

@@ -24,7 +24,7 @@ SAMPLE = np.dtype(
 Samples: TypeAlias = NDArray[np.void]
 """Structured array of shape (n,), dtype ``SAMPLE``: what every device's driver makes first."""
 
-# A gap may be this much longer than the time that passed, since arrivals are not even [s].
+# A gap and the time that passed may differ by this much, since arrivals are not even [s].
 _SLACK_S = 0.5
 # Copies of samples that were sent before are recognised this far back.
 _REMEMBERED = 1024
@@ -50,8 +50,8 @@ class Counting:
     timed: its samples carry its own time
     checked: a checksum guards the counter; without, a counter that leaps and comes back with
     the next sample is a spoilt telegram
-    period: of a device that runs freely [s]: its counter goes on in a silence, and cannot have
-    gone further than time has; 0 = triggered, its counter waits for the next trigger
+    period: of a device that runs freely [s]: its counter goes on in a silence, as far as time
+    does; 0 = triggered, its counter waits for the next trigger
     """
 
     modulus: int
@@ -188,8 +188,12 @@ class SequenceTracker:
         period = self._counting.period
         if not period:
             return step >= self._counting.modulus // 2
-        passed = advance * NANOSECOND_S if self._counting.timed else pause.elapsed
-        return (step - 1) * period > passed + _SLACK_S * (not self._counting.timed) + period
+        if self._counting.timed:
+            return step * period > advance * NANOSECOND_S + 2 * period
+        if not pause.broken:
+            return (step - 1) * period > pause.elapsed + _SLACK_S
+        whole = step + self._turns(step, pause) * self._counting.modulus
+        return abs(pause.elapsed - whole * period) > _SLACK_S
 
     def _turns(self, step: int, pause: _Break) -> int:
         """Whole turns of the counter that a silence hid."""

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, TypeAlias
 
+from omsm_ros.devices.capancdt import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.devices.chrocodile import ChrocodileSettings
 from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
 from omsm_ros.devices.chrocodile_packet import ChrocodilePacketDevice
+from omsm_ros.devices.confocaldt import (
+    ConfocalDtDevice,
+    ConfocalDtEthernetDevice,
+    ConfocalDtSettings,
+)
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
@@ -53,11 +59,17 @@ PARAMETERS = (
     Parameter("probe.polarity", _USUAL.probe.polarity, "+1: falls as z rises; -1: reversed"),
     Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
     Parameter("probe.intensity_full_scale", 100.0, "reading that is intensity 1"),
-    Parameter("encoders", "", "the probe's own on X Y Z B C, e.g. XYZUV; empty = none wired"),
+    Parameter(
+        "encoders",
+        "",
+        "CHRocodile: its inputs on X Y Z B C, e.g. XYZUV; confocalDT: the axes on "
+        "its encoders 1 2 3, e.g. XZC; empty = none wired",
+    ),
     Parameter("latch", "start", "of its encoders at the exposure's start, end, or their mean"),
     Parameter("trigger", "free_run", "free_run, each, once or window"),
     Parameter("format", "binary", "of the telegrams: binary or ascii"),
-    Parameter("signals", "", "numbers for $SODX; empty = what is needed"),
+    Parameter("signals", "", "CHRocodile: for $SODX; confocalDT RS-422: of a frame, in order"),
+    Parameter("command_port", 0, "TCP port for commands (confocalDT: 23); 0 = leave it as set"),
     Parameter("lamp", -1.0, "brightness 0-100; negative = as the device has it"),
     Parameter("averaging", -1, "samples; negative = as the device has it"),
     Parameter("threshold", -1.0, "of detection; negative = as the device has it"),
@@ -65,9 +77,23 @@ PARAMETERS = (
 )
 
 
-def defaults() -> dict[str, Any]:
+REFERENCE_PARAMETERS = (
+    Parameter("device", "capancdt", "what is connected: see the table of devices"),
+    Parameter("port", "tcp://169.254.168.150:10001", "tcp://host:port of the measured values"),
+    Parameter("command_port", 0, "TCP port for commands (capaNCDT: 23); 0 = leave it as set"),
+    Parameter("sample_period", 1e-3, "of the controller, or of its trigger [s]"),
+    Parameter("block_size", 100, "samples in a message"),
+    Parameter("channel", 1, "of the controller, from 1"),
+    Parameter("triggered", False, "samples come with a trigger from outside"),
+    Parameter("probe.full_scale", 250e-6, "measuring range of the channel [m]"),
+    Parameter("probe.polarity", 1, "+1: falls as z rises; -1: reversed"),
+    Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
+)
+
+
+def defaults(parameters: Sequence[Parameter] = PARAMETERS) -> dict[str, Any]:
     """Every parameter at its default."""
-    return {parameter.name: parameter.default for parameter in PARAMETERS}
+    return {parameter.name: parameter.default for parameter in parameters}
 
 
 def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
@@ -79,6 +105,25 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
     if make is None:
         raise ConfigurationError(f"device {values['device']!r}, expected one of {sorted(DEVICES)}")
     return make(values, transport_for(values["port"], values["baud_rate"]), now_ns)
+
+
+def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
+    """The reference sensor that ``values`` describe, not yet connected.
+
+    values: every name of REFERENCE_PARAMETERS. Raises ConfigurationError.
+    """
+    if values["device"] != "capancdt":
+        raise ConfigurationError(f"device {values['device']!r}, expected 'capancdt'")
+    probe = ProbeReading(
+        full_scale=values["probe.full_scale"],
+        zero=values["probe.zero"],
+        polarity=values["probe.polarity"],
+    )
+    settings = CapaNcdtSettings(
+        **_blocks(values), probe=probe, channel=values["channel"], triggered=values["triggered"]
+    )
+    commands = command_transport(values["port"], values["command_port"])
+    return CapaNcdtDevice(transport_for(values["port"]), settings, now_ns, commands=commands)
 
 
 def _axes(values: Values) -> dict[str, AxisScaling]:
@@ -122,6 +167,43 @@ def _chrocodile(
     return kind(transport, settings, now_ns)
 
 
+def _confocaldt(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+    words = tuple(values["signals"].replace(",", " ").split()) or ("distance",)
+    settings = ConfocalDtSettings(
+        **_blocks(values), probe=_probe_reading(values), values=words, trigger=values["trigger"]
+    )
+    return ConfocalDtDevice(transport, settings, now_ns)
+
+
+def _confocaldt_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+    settings = ConfocalDtSettings(
+        **_blocks(values),
+        probe=_probe_reading(values),
+        axes=tuple(_axes(values).values()) if values["encoders"] else None,
+        wired=_wired(values["encoders"]),
+        trigger=values["trigger"],
+    )
+    commands = command_transport(values["port"], values["command_port"])
+    return ConfocalDtEthernetDevice(transport, settings, now_ns, commands=commands)
+
+
+def command_transport(address: str, port: int) -> Transport | None:
+    """The port for commands of the device at ``address``; None for port 0."""
+    if port == 0:
+        return None
+    host, colon, _ = address.rpartition(":")
+    if not address.startswith("tcp://") or not colon:
+        raise ConfigurationError(f"command_port {port!r} needs a port tcp://host:port")
+    return transport_for(f"{host}:{port}")
+
+
+def _wired(text: str) -> tuple[int, ...]:
+    letters = "XYZBC"
+    if len(set(text.upper())) < len(text) or set(text.upper()) - set(letters):
+        raise ConfigurationError(f"encoders {text!r}, expected some of the letters {letters}")
+    return tuple(letters.index(letter) for letter in text.upper())
+
+
 def _probe_reading(values: Values) -> ProbeReading:
     return ProbeReading(**{f.name: values[f"probe.{f.name}"] for f in fields(ProbeReading)})
 
@@ -150,4 +232,6 @@ DEVICES: dict[str, Callable[[Values, Transport, NowNs], StreamDevice]] = {
     "six_channel": _six_channel,
     "chrocodile": partial(_chrocodile, ChrocodileDevice),
     "chrocodile_packet": partial(_chrocodile, ChrocodilePacketDevice),
+    "confocaldt": _confocaldt,
+    "confocaldt_ethernet": _confocaldt_ethernet,
 }

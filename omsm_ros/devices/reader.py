@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Protocol
 
 from omsm_ros.devices.blocks import BlockPair
-from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.errors import ConfigurationError, DeviceError, defect
 
 _READ_S = 0.05
 # The pause before connecting again doubles from the first to the second [s].
@@ -87,6 +87,9 @@ class DeviceReader:
                 self._hand_over(blocks)
         except (DeviceError, ConfigurationError) as err:
             self._tell(str(err))
+            self.state = State.LOST
+        except Exception as err:  # a defect of ours must not end the reading for good
+            self._tell(defect(err))
             self.state = State.LOST
         self._hand_over(self._device.close())
         return any_came

@@ -73,7 +73,7 @@ class StreamDevice:
         self._tracker = SequenceTracker(counting)
         self._cutter = BlockCutter(settings, channels)
         self._decoded = 0
-        self._heard = monotonic()
+        self._heard = self._opened = monotonic()
         self._down = False
 
     def open(self) -> None:
@@ -81,6 +81,7 @@ class StreamDevice:
         self._transport.open()
         self._down = True
         self._prepare()
+        self._opened = self._monotonic()
 
     def poll(self, timeout: float) -> list[BlockPair]:
         """Blocks completed by what arrives within ``timeout`` [s]; may be none.
@@ -98,7 +99,7 @@ class StreamDevice:
         if silent <= self._settings.pause:
             return []
         blocks = self._end(arrival_ns)
-        self._listen_in(silent)
+        self._listen_in(now - max(self._heard, self._opened))
         return blocks
 
     def close(self) -> list[BlockPair]:

@@ -133,6 +133,9 @@ class Instrument:
         """Whether samples are to be sent."""
         return True
 
+    def work(self) -> None:
+        """Do what else there is to do."""
+
     def greet(self) -> None:
         """Do what is done for a new client."""
 
@@ -157,6 +160,7 @@ class Instrument:
         if now < self._quiet_until:
             self._measure(now)
             return
+        self.work()
         data = self._line.read()
         if self._line.sessions != self._session:
             self._session = self._line.sessions

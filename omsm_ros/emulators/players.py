@@ -11,6 +11,7 @@ from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
 from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
 from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
 from omsm_ros.emulators.instrument import Instrument, Line
+from omsm_ros.emulators.micro_epsilon import ConfocalDtEmulator
 from omsm_ros.emulators.pseudo_terminal import Pty
 from omsm_ros.emulators.sources import RecordingSource
 from omsm_ros.emulators.tcp_server import TcpServer
@@ -141,6 +142,13 @@ def _chrocodile_packet(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(emulator)
 
 
+def _confocaldt_ethernet(line: Line, faults: Faults) -> Player:
+    emulator = ConfocalDtEmulator(
+        line, triggered=True, seed=faults.seed, probe=_READING, axes=AXIS_SCALING
+    )
+    return InstrumentPlayer(emulator)
+
+
 _OWN_ENCODERS: dict[str, object] = {
     "encoders": "XYZUV",
     "trigger": "each",
@@ -154,6 +162,10 @@ EMULATED = {
     "six_channel": Emulated(StreamPlayer, {}),
     "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
     "chrocodile_packet": Emulated(_chrocodile_packet, _OWN_ENCODERS, tcp=True),
+    # Y and B stand still in the twin's motions: three encoders are enough.
+    "confocaldt_ethernet": Emulated(
+        _confocaldt_ethernet, _OWN_ENCODERS | {"encoders": "XZC"}, tcp=True
+    ),
 }
 
 

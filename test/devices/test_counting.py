@@ -77,7 +77,7 @@ def test_a_leap_is_held_until_the_next_sample_tells() -> None:
     assert tracker.lost == 6
 
 
-@pytest.mark.parametrize(("silence", "lost"), [(0.5, 100), (65.7, 100 + 65_536), (131.2, 131_172)])
+@pytest.mark.parametrize(("silence", "lost"), [(0.1, 100), (65.7, 100 + 65_536), (131.2, 131_172)])
 def test_whole_turns_in_a_silence_are_found_from_its_length(silence: float, lost: int) -> None:
     tracker = SequenceTracker(FREE)
     numbers(tracker, samples([7]))
@@ -89,6 +89,14 @@ def test_more_samples_than_time_passed_for_are_a_restart() -> None:
     tracker = SequenceTracker(FREE)
     numbers(tracker, samples([100]))
     assert numbers(tracker, samples([5000, 5001]), elapsed=1.0, broken=True) == [5000, 5001]
+    assert (tracker.restarts, tracker.lost) == (1, 0)
+
+
+def test_fewer_samples_than_time_passed_for_are_a_restart() -> None:
+    """The counter began again at zero, and has come as far as if it had only lost some."""
+    tracker = SequenceTracker(FREE)
+    numbers(tracker, samples([1000]))
+    assert numbers(tracker, samples([2300, 2301]), elapsed=2.3, broken=True) == [2300, 2301]
     assert (tracker.restarts, tracker.lost) == (1, 0)
 
 

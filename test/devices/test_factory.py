@@ -6,7 +6,15 @@ from typing import Any
 
 import pytest
 
-from omsm_ros.devices.factory import DEVICES, PARAMETERS, defaults, make_device
+from omsm_ros.devices.factory import (
+    DEVICES,
+    PARAMETERS,
+    REFERENCE_PARAMETERS,
+    command_transport,
+    defaults,
+    make_device,
+    make_reference,
+)
 from omsm_ros.emulators.players import EMULATED
 from omsm_ros.errors import ConfigurationError
 
@@ -19,7 +27,8 @@ def test_every_device_is_made_from_the_defaults(name: str) -> None:
 
 
 def test_every_emulated_device_has_its_driver() -> None:
-    assert set(EMULATED) == set(DEVICES)
+    # A probe without encoders is no whole cell.
+    assert set(EMULATED) == set(DEVICES) - {"confocaldt"}
     names = {parameter.name for parameter in PARAMETERS}
     for emulated in EMULATED.values():
         assert set(emulated.driver) <= names
@@ -47,3 +56,20 @@ def test_parameters_reach_the_device() -> None:
     assert settings.encoders == (0, 1, 2, 4, 3)
     assert (settings.lamp, settings.averaging) == (30.0, None)
     assert settings.probe.zero == 5e-5
+
+
+def test_a_reference_is_made_from_its_defaults() -> None:
+    values = defaults(REFERENCE_PARAMETERS)
+    assert make_reference(values).statistics.decoded == 0
+    assert make_reference(values | {"command_port": 23}).identity == {}
+    with pytest.raises(ConfigurationError, match="device 'ruler'"):
+        make_reference(values | {"device": "ruler"})
+
+
+def test_commands_go_to_the_same_host() -> None:
+    transport = command_transport("tcp://10.0.0.7:1024", 23)
+    assert transport is not None
+    assert transport.name == "tcp://10.0.0.7:23"
+    assert command_transport("tcp://10.0.0.7:1024", 0) is None
+    with pytest.raises(ConfigurationError, match="needs a port tcp://"):
+        command_transport("/dev/ttyUSB0", 23)

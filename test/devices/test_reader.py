@@ -73,6 +73,13 @@ def test_it_connects_again_and_tells_each_trouble_once() -> None:
     ]
 
 
+def test_a_defect_is_told_and_survived() -> None:
+    reader, notes, got = run([[], []], [ZeroDivisionError("of ours"), [BLOCK]])
+    assert len(got) == 1
+    assert reader.connections == 2
+    assert "of ours" in notes[1]
+
+
 def test_the_device_own_trouble_is_passed_on() -> None:
     stop = threading.Event()
     device = Scripted(stop, [[]], [[BLOCK]])

@@ -11,7 +11,7 @@ import pytest
 
 from omsm_ros.core.samples.blocks import Status
 from omsm_ros.devices.blocks import BlockPair
-from omsm_ros.devices.factory import DEVICES, defaults, make_device
+from omsm_ros.devices.factory import defaults, make_device
 from omsm_ros.devices.reader import DeviceReader
 from omsm_ros.emulators.generic_stream import Faults
 from omsm_ros.emulators.players import EMULATED, emulated, line_for
@@ -52,7 +52,7 @@ def wait(done: object, reader: DeviceReader) -> None:
 
 
 @pytest.mark.parametrize("where", ["pty", "tcp"])
-@pytest.mark.parametrize("name", DEVICES)
+@pytest.mark.parametrize("name", EMULATED)
 def test_the_twins_motion_comes_out(
     name: str, where: str, tmp_path: Path, step_test: Recording
 ) -> None:

@@ -1,0 +1,244 @@
+"""Micro-Epsilon confocalDT controllers, over RS-422 or Ethernet.
+
+Untried on hardware. Over RS-422 the driver only listens: which values a frame holds is a
+setting. Over Ethernet the blocks say what they hold, and the rate is set and read back where
+a command port is given.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import IntArray, Status
+from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
+from omsm_ros.devices.command_port import CommandPort
+from omsm_ros.devices.counting import SAMPLE, Counting, Samples
+from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.transport import Transport
+from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.protocols.confocaldt_serial import VALUE_BITS, SerialDecoder, distance_of
+from omsm_ros.protocols.generic_stream import AXES, AxisScaling
+from omsm_ros.protocols.micro_epsilon import Block, BlockDecoder, confocal_dtype
+from omsm_ros.units import NANOMETRE_M
+
+SERIAL_VALUES = ("distance", "intensity", "counter")
+PROMPTS = (b"->",)
+# Intensity 100 % is 1024, in the lowest eleven bits.
+_INTENSITY_MASK, _INTENSITY_FULL = 0x7FF, 1024
+# Distances from here on are error codes, not nanometres.
+_FIRST_ERROR = 0x7FFFFF00
+_COUNTER_RANGE = 2**32
+_KILOHERTZ = 1000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfocalDtSettings(BlockSettings):
+    """How the controller is read.
+
+    probe: ``full_scale`` is the measuring range, of which RS-422 values are parts
+    values: what a frame holds over RS-422, in order, of SERIAL_VALUES
+    axes: scaling of X, Y, Z, B, C, or None;  wired: axes on encoders 1, 2, 3 (0 = X … 4 = C);
+    an axis without an encoder stands at its offset
+    intensity_first: order of intensity and distance in an Ethernet frame
+    trigger: "free_run", or anything else for a trigger from outside
+    patience: for an answer, and for samples of a controller that runs freely [s]
+    """
+
+    probe: ProbeReading = field(default_factory=ProbeReading)
+    values: tuple[str, ...] = ("distance",)
+    axes: tuple[AxisScaling, ...] | None = None
+    wired: tuple[int, ...] = ()
+    intensity_first: bool = False
+    trigger: str = "free_run"
+    patience: float = 2.0
+
+    def __post_init__(self) -> None:
+        BlockSettings.__post_init__(self)
+        if "distance" not in self.values or set(self.values) - set(SERIAL_VALUES):
+            raise ConfigurationError(f"values {self.values!r}, expected some of {SERIAL_VALUES!r}")
+        if len(set(self.wired)) < len(self.wired) or set(self.wired) - set(range(len(AXES))):
+            raise ConfigurationError(f"wired {self.wired!r}, expected axes 0 to 4, each once")
+
+    @property
+    def period(self) -> float:
+        """Of a controller that runs freely [s]; 0 = triggered."""
+        return self.sample_period if self.trigger == "free_run" else 0.0
+
+
+class ConfocalDtDevice(StreamDevice):
+    """Listens to three bytes a value.
+
+    Where no counter is selected, frames are counted: a place where bytes were missing counts
+    as one lost sample, a silence as a restart.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ConfocalDtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        settings = settings or ConfocalDtSettings()
+        counted = "counter" in settings.values
+        modulus = 2**VALUE_BITS if counted else 2**62
+        counting = Counting(modulus, timed=False, checked=not counted, period=settings.period)
+        base = replace(settings, free_running=settings.period > 0)
+        super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
+        self._wanted = settings
+        self._decoder = SerialDecoder(len(settings.values))
+        self._counted = 0
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        if "counter" not in self._wanted.values:
+            self._tracker.begin_anew()
+
+    def _decode(self, data: bytes) -> Samples:
+        values, spoilt = self._decoder.feed(data)
+        columns = dict(zip(self._wanted.values, values.T, strict=True))
+        samples = np.zeros(len(values), SAMPLE)
+        raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
+        samples["distance"] = self._wanted.probe.distance(raw)
+        samples["intensity"] = np.nan
+        if "intensity" in columns:
+            light = (columns["intensity"] & _INTENSITY_MASK) / _INTENSITY_FULL
+            samples["intensity"] = np.minimum(light, 1.0)
+        if "counter" in columns:
+            samples["counter"] = columns["counter"]
+        elif len(samples):
+            samples["counter"] = self._counted + np.cumsum(1 + spoilt) - 1
+            self._counted = int(samples["counter"][-1]) + 1
+        return samples
+
+    def _listen_in(self, silent: float) -> None:
+        if "counter" not in self._wanted.values:
+            self._tracker.begin_anew()
+        _must_talk(self._transport.name, self._wanted, silent)
+
+
+class ConfocalDtEthernetDevice(StreamDevice):
+    """Reads blocks, and sets the measuring rate where there is a command port."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ConfocalDtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+        commands: Transport | None = None,
+    ) -> None:
+        """commands: the controller's port 23; None = leave it as it is set."""
+        settings = settings or ConfocalDtSettings()
+        counting = Counting(_COUNTER_RANGE, timed=False, period=settings.period)
+        channels = Channels(axes=_wrapping(settings.axes), timed=False)
+        base = replace(settings, free_running=settings.period > 0)
+        super().__init__(transport, base, channels, counting, now_ns, monotonic)
+        self._wanted = settings
+        self._decoder = BlockDecoder("confocal", self._dtype)
+        self._commands = commands
+        self._identity: dict[str, str] = {}
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Return what the controller told of itself."""
+        return self._identity
+
+    def _dtype(self, flags: tuple[int, int]) -> np.dtype[np.void]:
+        return confocal_dtype(flags, self._wanted.intensity_first)
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        if self._commands is None:
+            return
+        with CommandPort(self._commands, PROMPTS, self._wanted.patience, self._monotonic) as port:
+            self._identity = _info(port.ask("GETINFO", "\n"))
+            self._set_rate(port)
+
+    def _set_rate(self, port: CommandPort) -> None:
+        wanted = 1 / (self._wanted.sample_period * _KILOHERTZ)
+        said = port.ask(f"MEASRATE {wanted:.4g}", "\n")
+        if error := re.search(r"E\d\d[^\r\n]*", said):
+            raise DeviceError(
+                f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
+            )
+        found = re.search(r"MEASRATE\s+([\d.]+)", port.ask("MEASRATE", "\n").rpartition("\n")[0])
+        if found and abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
+            raise DeviceError(
+                f"{self._transport.name}: {wanted:.4g} kHz was asked for, the controller measures "
+                f"at {found[1]} kHz; set sample_period to {1e-3 / float(found[1]):.9g} s"
+            )
+
+    def _decode(self, data: bytes) -> Samples:
+        parts = [self._samples(block) for block in self._decoder.feed(data)]
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _samples(self, block: Block) -> Samples:
+        frames = block.frames.reshape(-1).view(self._dtype(block.kind))
+        self._identity |= {"order": str(block.order), "serial": str(block.serial)}
+        names = frames.dtype.names or ()
+        samples = np.zeros(len(frames), SAMPLE)
+        counter = block.counter + np.arange(len(frames))
+        samples["counter"] = frames["counter"] if "counter" in names else counter % _COUNTER_RANGE
+        raw = frames["distance 1"].astype(np.int64)
+        nothing = raw >= _FIRST_ERROR
+        metres = np.where(nothing, np.nan, raw * NANOMETRE_M)
+        samples["distance"] = self._wanted.probe.distance(metres)
+        beyond = np.abs(metres) > self._wanted.probe.full_scale
+        samples["status"] = np.select(
+            [nothing, beyond], [Status.NO_TARGET, Status.OUT_OF_RANGE], Status.OK
+        )
+        samples["intensity"] = np.nan
+        if "intensity 1" in names:
+            light = (frames["intensity 1"] & _INTENSITY_MASK) / _INTENSITY_FULL
+            samples["intensity"] = np.minimum(light, 1.0)
+        for number, axis in enumerate(self._wanted.wired, start=1):
+            samples["counts"][:, axis] = self._encoder(frames, number)
+        return samples
+
+    def _encoder(self, frames: np.ndarray[tuple[int], np.dtype[np.void]], number: int) -> IntArray:
+        if f"encoder {number}" not in (frames.dtype.names or ()):
+            raise DeviceError(
+                f"{self._transport.name} sends no encoder {number}; select it "
+                "(OUTADD_ETH … ENC1 ENC2 ENC3) or take the axis from `encoders`"
+            )
+        counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
+        return counts
+
+    def _listen_in(self, silent: float) -> None:
+        _must_talk(self._transport.name, self._wanted, silent)
+
+
+def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
+    if settings.period and silent > settings.patience:
+        raise DeviceError(
+            f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "
+            "interface and (RS-422) baud rate; connecting again"
+        )
+
+
+def _info(said: str) -> dict[str, str]:
+    """``Name: value`` lines of an answer."""
+    pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", said)
+    return {key.strip().lower(): value.strip() for key, value in pairs}
+
+
+def _wrapping(axes: tuple[AxisScaling, ...] | None) -> tuple[AxisScaling, ...] | None:
+    """The encoders wrap with their 32 bits where nothing else is said."""
+    if axes is None:
+        return None
+    return tuple(replace(axis, wrap=axis.wrap or _COUNTER_RANGE) for axis in axes)

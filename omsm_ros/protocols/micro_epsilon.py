@@ -1,0 +1,211 @@
+"""Blocks of measured values that Micro-Epsilon controllers send over TCP, little-endian.
+
+A header with a preamble, the controller's numbers, what the frames hold, how many there are
+and how long, and the counter of the first; then the frames. ``HEADERS`` has the two forms:
+confocalDT 24xx says by flags what a frame holds, capaNCDT 62xx by a field of channels.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import ProtocolError
+
+# "MEAS" as text, and as a 32-bit number sent low byte first: manuals give both readings.
+PREAMBLES = (b"MEAS", b"SAEM")
+# A TCP packet holds a block; a longer one is a misread header.
+MAX_BLOCK_BYTES = 1 << 20
+
+HEADERS = {
+    # preamble, order, serial, flags 1, flags 2, frames, bytes a frame, counter
+    "confocal": struct.Struct("<4sIIIIHHI"),
+    # preamble, order, serial, channels, status, frames, bytes a frame, counter
+    "capacitive": struct.Struct("<4sIIQIHHI"),
+}
+
+# --- what a frame holds
+
+_VIDEO_BYTES = 1024
+# Bit of flags 1 → name and size [bytes] of what it adds to a frame, in the order of the frame.
+FLAGS_1: tuple[tuple[int, str, int], ...] = (
+    *((bit, f"video {bit}", _VIDEO_BYTES) for bit in (0, 2, 3, 4, 5, 6)),
+    (7, "exposure", 4),
+    (8, "encoder 1", 4),
+    (9, "encoder 2", 4),
+    (10, "encoder 3", 4),
+    (11, "counter", 4),
+    (12, "time", 4),
+)
+INTENSITY_BIT, VALUE_BIT, PEAK_BITS = 15, 18, range(19, 25)
+AFTER_PEAKS: tuple[tuple[int, str, int], ...] = ((26, "error", 4), (27, "trigger difference", 4))
+FLAGS_2: tuple[tuple[int, str, int], ...] = (
+    (0, "thickness", 4),
+    (15, "minimum", 4),
+    (16, "maximum", 4),
+    (17, "peak to peak", 4),
+)
+_SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
+
+
+class Block(NamedTuple):
+    """One block.  kind: what its frames hold, in the header's own coding;  frames: (n, bytes)."""
+
+    order: int
+    serial: int
+    kind: tuple[int, int]
+    counter: int
+    frames: NDArray[np.uint8]
+
+
+def confocal_dtype(flags: tuple[int, int], intensity_first: bool = False) -> np.dtype[np.void]:
+    """What the flags of a confocalDT say a frame holds; ProtocolError if it has no distance.
+
+    intensity_first: order of the two values of a peak; the public description shows distance
+    first, the flags are numbered the other way
+    """
+    fields = [(name, size) for bit, name, size in FLAGS_1 if flags[0] >> bit & 1]
+    peaks = sum(flags[0] >> bit & 1 for bit in PEAK_BITS)
+    if not peaks and flags[0] >> VALUE_BIT & 1:
+        peaks = 1
+    if not peaks:
+        raise ProtocolError(f"flags {flags[0]:#x} {flags[1]:#x} hold no distance")
+    for peak in range(1, peaks + 1):
+        pair = [(f"distance {peak}", 4)]
+        if flags[0] >> INTENSITY_BIT & 1:
+            pair.insert(0 if intensity_first else 1, (f"intensity {peak}", 4))
+        fields += pair
+    for word, table in ((flags[0], AFTER_PEAKS), (flags[1], FLAGS_2)):
+        fields += [(name, size) for bit, name, size in table if word >> bit & 1]
+    return np.dtype([(name, _format(name, size)) for name, size in fields])
+
+
+def _format(name: str, size: int) -> str:
+    if size == _VIDEO_BYTES:
+        return f"V{size}"
+    return "<i4" if name.startswith(_SIGNED) else "<u4"
+
+
+def channel_dtype(field: int) -> np.dtype[np.void]:
+    """What the channel field of a capaNCDT says a frame holds: 24-bit values by channel."""
+    present = [f"channel {i + 1}" for i in range(32) if field >> 2 * i & 0b11]
+    if not present:
+        raise ProtocolError(f"channel field {field:#x} names no channel")
+    return np.dtype([(name, "<i4") for name in present])
+
+
+def encode_block(form: str, block: Block, preamble: bytes = PREAMBLES[0]) -> bytes:
+    """Wire bytes of a block; form: of HEADERS."""
+    head = HEADERS[form].pack(
+        preamble, block.order, block.serial, *block.kind, *block.frames.shape, block.counter
+    )
+    return head + block.frames.tobytes()
+
+
+# --- decoding
+
+
+@dataclass(frozen=True, slots=True)
+class BlockStatistics:
+    """What became of every byte: ``received = in blocks + discarded + pending``.
+
+    packets: understood;  malformed: headers that make no sense
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    packets: int
+    malformed: int
+
+
+class BlockDecoder:
+    """Bytes in any portions → blocks; nothing raises, memory is one block and a portion."""
+
+    def __init__(self, form: str, dtype_of: Callable[[tuple[int, int]], np.dtype[np.void]]) -> None:
+        """form: of HEADERS;  dtype_of: what frames hold, or ProtocolError."""
+        self._header = HEADERS[form]
+        self._dtype_of = dtype_of
+        self._buffer = b""
+        self._received = self._understood = self._packets = self._malformed = 0
+
+    def reset(self) -> None:
+        """Forget an unfinished block, as after connecting anew."""
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> list[Block]:
+        """Blocks completed by ``data``, in order."""
+        self._received += len(data)
+        self._buffer += data
+        found: list[Block] = []
+        start = 0
+        while (place := self._find(start)) >= 0:
+            size = self._size(place)
+            if size is None:
+                start = place
+                break
+            if size == 0:
+                self._malformed += 1
+                start = place + 1
+                continue
+            found.append(self._block(place, size))
+            start = place + size
+        else:
+            start = max(start, len(self._buffer) - len(PREAMBLES[0]) + 1)
+        self._buffer = self._buffer[start:]
+        return found
+
+    @property
+    def statistics(self) -> BlockStatistics:
+        """Return what became of every byte."""
+        return BlockStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - self._understood - len(self._buffer),
+            bytes_pending=len(self._buffer),
+            packets=self._packets,
+            malformed=self._malformed,
+        )
+
+    def _find(self, start: int) -> int:
+        places = [self._buffer.find(preamble, start) for preamble in PREAMBLES]
+        return min((place for place in places if place >= 0), default=-1)
+
+    def _size(self, place: int) -> int | None:
+        """Bytes of the block at ``place``; 0 = it is none; None = not all here yet."""
+        if place + self._header.size > len(self._buffer):
+            return None
+        fields = self._header.unpack_from(self._buffer, place)
+        count, width = fields[-3], fields[-2]
+        size = self._header.size + count * width
+        try:
+            sound = count > 0 and width == self._dtype_of(fields[3:5]).itemsize
+        except ProtocolError:
+            sound = False
+        if not sound or size > MAX_BLOCK_BYTES or self._cut_off(place, size):
+            return 0
+        return size if place + size <= len(self._buffer) else None
+
+    def _cut_off(self, place: int, size: int) -> bool:
+        """Whether another block begins inside the one at ``place``, or none at its end."""
+        end = place + size
+        after = self._buffer[end:][: len(PREAMBLES[0])]
+        if not any(preamble.startswith(after) for preamble in PREAMBLES):
+            return True
+        head = self._buffer[place : place + 12]  # preamble and the controller's own numbers
+        inside = self._buffer.find(head, place + 1, end + len(head) - 1)
+        return 0 <= inside < end
+
+    def _block(self, place: int, size: int) -> Block:
+        fields = self._header.unpack_from(self._buffer, place)
+        count, width, counter = fields[-3:]
+        raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
+        self._packets += 1
+        self._understood += size
+        return Block(
+            fields[1], fields[2], (fields[3], fields[4]), counter, raw.reshape(count, width)
+        )
