@@ -9,10 +9,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from rosbags.rosbag2 import Reader
+from scipy import signal
 
-from benchmarks.row import Row, at_most
+from benchmarks.row import Row, at_least, at_most
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.storage import bags
@@ -23,6 +26,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 PAPER_POINTS = 290_011
 LONG_POINTS = 50_000_000
 _BLOCK = 100
+_RUNS = 5
 
 
 def _write_bag(path: Path, samples: int, block: int = _BLOCK) -> None:
@@ -62,16 +66,67 @@ def _calibration(path: Path) -> None:
     )
 
 
-def _correct(folder: Path, bag: str) -> tuple[float, float]:
-    """Seconds and peak memory [GiB] of ``omsm correct`` on a bag."""
-    command = [sys.executable, "-m", "omsm_ros.cli", "correct", str(folder / bag), "--no-report"]
+class Used(NamedTuple):
+    """What a finished process took: wall clock and processor [s], peak memory [GiB]."""
+
+    wall: float
+    cpu: float
+    memory: float
+
+
+def _correct(folder: Path, bag: str, report: bool = False) -> Used:
+    """``omsm correct`` on a bag, as a process of its own."""
+    command = [sys.executable, "-m", "omsm_ros.cli", "correct", str(folder / bag)]
     command += ["--calibration", str(folder / "cal.json"), "--out", str(folder / "result")]
+    command += [] if report else ["--no-report"]
     begin = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise RuntimeError(f"omsm correct ended with {status}")
-    return time.perf_counter() - begin, usage.ru_maxrss * 1024 / 2**30
+    wall = time.perf_counter() - begin
+    return Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 2**30)
+
+
+def _whole_processes(folder: Path) -> Iterator[Row]:
+    """The paper's scan with and without its page, beside what loading scipy.signal takes."""
+    for report, limit in ((False, 1.0), (True, 2.0)):
+        runs = [_correct(folder, "paper.mcap", report) for _ in range(_RUNS)]
+        wall, cpu = (float(np.median([getattr(r, n) for r in runs])) for n in ("wall", "cpu"))
+        name = f"omsm correct, 290 011 points, whole process, {'' if report else 'no '}report"
+        peer = f"{cpu:.2f} s of a core"
+        yield at_most(name, wall, "s", limit, peer, runs=_RUNS)
+    command = [sys.executable, "-c", "import scipy.signal"]
+    loading = []
+    for _ in range(_RUNS):
+        begin = time.perf_counter()
+        subprocess.run(command, check=True)
+        loading.append(time.perf_counter() - begin)
+    yield _figure("python -c 'import scipy.signal', beside it", float(np.median(loading)), "s")
+
+
+def _rates(folder: Path, samples: int, used: Used, start: Used) -> Iterator[Row]:
+    """Samples a second and core from bag to cloud, beside a bare read and one linear filter."""
+    ours = (samples - PAPER_POINTS) / (used.cpu - start.cpu)
+    begin = time.process_time()
+    with Reader(folder / "long.mcap") as reader:
+        for _ in reader.messages():
+            pass
+    read = samples / (time.process_time() - begin)
+    numerator, denominator = signal.butter(5, 0.2)
+    z = np.random.default_rng(0).normal(size=1_000_000)
+    begin = time.process_time()
+    signal.lfilter(numerator, denominator, z)
+    filtered = len(z) / (time.process_time() - begin)
+    name = "bag to cloud with uncertainty, long bag, samples a second and core"
+    yield at_least(name, ours / 1e6, "10⁶/s", 2.5)
+    yield _figure("  bare read of the same bag, times as fast", read / ours, "1")
+    yield _figure("  scipy.signal.lfilter of order 5, times as fast", filtered / ours, "1")
+
+
+def _figure(name: str, value: float, unit: str) -> Row:
+    """A figure beside others, with no bar of its own."""
+    return Row(name=name, value=value, unit=unit, runs=None, peer=None, bar="", holds=None)
 
 
 def rows(full: bool) -> Iterator[Row]:
@@ -82,12 +137,14 @@ def rows(full: bool) -> Iterator[Row]:
         _calibration(folder / "cal.json")
         for bag, samples in (("paper", PAPER_POINTS), ("ten", 10 * PAPER_POINTS)):
             _write_bag(folder / f"{bag}.mcap", samples)
-        once = min(_correct(folder, "paper.mcap")[0] for _ in range(3))
-        yield at_most("omsm correct, 290 011 points, whole process", once, "s", 1.5)
-        ten = _correct(folder, "ten.mcap")[0]
-        yield at_most("omsm correct, ten times the samples: times the time", ten / once, "1", 11.0)
+        yield from _whole_processes(folder)
+        once = _correct(folder, "paper.mcap")
+        ten = _correct(folder, "ten.mcap")
+        text = "omsm correct, ten times the samples: times the time"
+        yield at_most(text, ten.cpu / once.cpu, "1", 11.0)
         _write_bag(folder / "long.mcap", long_points)
-        seconds, memory = _correct(folder, "long.mcap")
+        used = _correct(folder, "long.mcap")
+        yield from _rates(folder, long_points, used, once)
         size = (folder / "long.mcap").stat().st_size / 2**30
-        text = f"bag of {size:.1f} GiB, {seconds:.0f} s"
-        yield at_most(f"omsm correct, {long_points} points: memory", memory, "GiB", 1.0, text)
+        text = f"bag of {size:.1f} GiB, {used.wall:.0f} s"
+        yield at_most(f"omsm correct, {long_points} points: memory", used.memory, "GiB", 1.0, text)
