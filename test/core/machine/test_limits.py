@@ -185,3 +185,25 @@ def test_highest_factor_of_a_line() -> None:
 def test_a_senseless_limit_is_named(value: float) -> None:
     with pytest.raises(ConfigurationError, match="z_jerk"):
         MachineLimits(z_jerk=value)
+
+
+@pytest.mark.parametrize("power", [0.3, 1.0, 2.0, 6.0])
+@pytest.mark.parametrize("factor", [0.011, 0.2, 1.0, 40.7, 99.0])
+def test_highest_factor_of_a_power_takes_few_values(power: float, factor: float) -> None:
+    asked: list[float] = []
+
+    def value(k: float) -> float:
+        asked.append(k)
+        return 5.0 * (k / factor) ** power
+
+    found = highest_factor(value, 5.0)
+    assert factor * (1 - 1e-3) < found <= factor * (1 + 1e-9)
+    assert len(asked) < 10
+
+
+def test_highest_factor_of_a_bend_and_of_a_jump() -> None:
+    # Noise at low speed, a resonance at high: the line is broken twice.
+    found = highest_factor(lambda k: 1.0 + k**2 + 1e-3 * k**6, 30.0)
+    assert 1.0 + found**2 + 1e-3 * found**6 == pytest.approx(30.0, rel=1e-3)
+    jump = highest_factor(lambda k: 0.0 if k < 7.0 else 9.0, 1.0)
+    assert 7.0 * (1 - 1e-3) < jump < 7.0
