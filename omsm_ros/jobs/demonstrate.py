@@ -17,6 +17,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.emulators.players import emulated
 from omsm_ros.errors import OmsmError
@@ -207,7 +208,7 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
 
 def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
     """One wide picture: map before in µm, after in nm, identified and true response."""
-    weights = form.spiral_weights(view.x, view.y)
+    weights = area_weights(view.x, view.y)
     raw, corrected = (
         form.level(view.x, view.y, form.deviation(view.x, view.y, h, PAPER_MIRROR), weights=weights)
         for h in (view.raw_height, view.height)

@@ -12,9 +12,13 @@ import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
 
 _SECTORS = 12
+# Three numbers each: 24 MB.
+_MOST_WEIGHED = 1_000_000
 # Beyond this a spacing is a mistaken unit, and its rings would not fit into memory.
 _MOST_STRETCHES = 1_000_000
 
@@ -91,29 +95,6 @@ def level(
     return np.asarray(deviation - design @ fitted, np.float64)
 
 
-def spiral_weights(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Area per point of a spiral about the origin, (n,), of mean 1.
-
-    At constant feed and speed the points are uniform in radius and angle, so that the
-    area r·dr·dθ of a point is proportional to its radius.
-    """
-    _check(x=x, y=y)
-    return _mean_one(np.hypot(x, y))
-
-
-def density_weights(x: FloatArray, y: FloatArray, cells: int = 50) -> FloatArray:
-    """Area per point of any cloud, (n,), of mean 1: one over the points in its cell.
-
-    The bounding box is cut into ``cells`` × ``cells``; choose them wide enough to hold
-    several points, or every point weighs the same.
-    """
-    _check(x=x, y=y)
-    if cells < 1:
-        raise DataError(f"cells is {cells!r}, expected 1 or more")
-    cell = _cell_numbers(x, cells) * cells + _cell_numbers(y, cells)
-    return _mean_one(1.0 / np.bincount(cell)[cell])
-
-
 def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
     """Figures of a deviation (n,) [m] whose points stand for areas ∝ ``weights`` (n,).
 
@@ -137,41 +118,43 @@ def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
 class RunningStatistics:
     """Statistics of a cloud that comes in portions, its piston removed as by :func:`level`.
 
-    Weights are radii, as for :func:`spiral_weights`. Exact up to rounding: sums are taken
-    about the first value, for a deviation is small against its stand-off.
+    Peak to valley and rms are of all points, exact up to rounding: sums are taken about the first
+    value, for a deviation is small against its stand-off. What is weighted by area is of all, or
+    of half a million and more of them, evenly chosen.
     """
 
     def __init__(self) -> None:
         self._points = 0
         self._start = 0.0
         self._least, self._most = np.inf, -np.inf
-        # Of weight 1 and of weight radius: Σw, Σw d, Σw d².
-        self._sums = np.zeros((2, 3))
+        self._sum = self._square = 0.0
+        self._weighed = EvenSelection(_MOST_WEIGHED)
 
     def add(self, x: FloatArray, y: FloatArray, deviation: FloatArray) -> None:
-        """Take in a portion, each array (n,) [m]."""
+        """Take in the next portion of the scan, each array (n,) [m]."""
         _check(x=x, y=y, deviation=deviation)
         if not self._points:
             self._start = float(deviation[0])
         shifted = deviation - self._start
-        for row, weight in zip(self._sums, (np.ones_like(x), np.hypot(x, y)), strict=True):
-            weighted = weight * shifted
-            row += weight.sum(), weighted.sum(), weighted @ shifted
+        self._sum += float(shifted.sum())
+        self._square += float(shifted @ shifted)
         self._points += len(x)
         self._least = min(self._least, float(shifted.min()))
         self._most = max(self._most, float(shifted.max()))
+        self._weighed.add(np.stack([x, y, shifted], axis=1))
 
     def statistics(self) -> FormStatistics:
-        """Of all portions so far. Raises DataError if there was none, or all lie at the centre."""
-        (count, plain, plain_square), (total, weighted, weighted_square) = self._sums
-        if not total > 0:
-            raise DataError(f"{self._points} points, none of them off the spindle axis")
-        piston = weighted / total
-        mean_square = (plain_square - 2 * piston * plain) / count + piston**2
+        """Of all portions so far. Raises DataError if there was none."""
+        if not self._points:
+            raise DataError("0 points: there is nothing to take statistics of")
+        x, y, shifted = self._weighed.rows().T
+        weights = area_weights(x, y)
+        piston = float(np.average(shifted, weights=weights))
+        about_piston = self._square - 2 * piston * self._sum
         return FormStatistics(
             peak_to_valley=self._most - self._least,
-            rms=float(np.sqrt(max(mean_square, 0.0))),
-            rms_area_weighted=float(np.sqrt(max(weighted_square / total - piston**2, 0.0))),
+            rms=float(np.sqrt(max(about_piston / self._points + piston**2, 0.0))),
+            rms_area_weighted=float(np.sqrt(np.average((shifted - piston) ** 2, weights=weights))),
             points=self._points,
         )
 
@@ -242,17 +225,6 @@ def _stretches(position: FloatArray, spacing: float) -> IntArray:
             f"spacing {spacing!r} m cuts the profile into {extent:.0f} stretches; widen it"
         )
     return np.asarray(np.floor(position / spacing), np.int64)
-
-
-def _cell_numbers(values: FloatArray, cells: int) -> IntArray:
-    span = np.ptp(values) or 1.0
-    number = (values - values.min()) / span * cells
-    return np.asarray(np.minimum(number, cells - 1), np.int64)
-
-
-def _mean_one(weights: FloatArray) -> FloatArray:
-    mean = float(np.mean(weights))
-    return weights / mean if mean > 0 else np.ones_like(weights)
 
 
 def _check(**arrays: FloatArray) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.report.common import style
 from omsm_ros.report.measurement import figures
 from omsm_ros.report.measurement.cloud_view import CloudView
@@ -27,7 +28,7 @@ def surface_figures(
 
     true_height, true_error_left: of each point [m], (n,), known on the twin only
     """
-    weights = form.spiral_weights(cloud.x, cloud.y)
+    weights = area_weights(cloud.x, cloud.y)
     made = {"dynamic_error": _error_trace(cloud, true_error_left)}
     if true_error_left is not None:
         made["error_histogram"] = style.png(

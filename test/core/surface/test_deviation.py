@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
 from omsm_ros.errors import DataError
 
@@ -80,7 +81,7 @@ class TestLevel:
         x, y = spiral
         # The mean of ρ² over a disk is 1/2; over a spiral's points it is 1/3.
         bowl = AMPLITUDE * (x**2 + y**2) / RADIUS**2
-        weighted = form.level(x, y, bowl, weights=form.spiral_weights(x, y))
+        weighted = form.level(x, y, bowl, weights=area_weights(x, y))
         assert np.mean(bowl - weighted) == pytest.approx(AMPLITUDE / 2, rel=1e-4)
         assert np.mean(bowl - form.level(x, y, bowl)) == pytest.approx(AMPLITUDE / 3, rel=1e-4)
 
@@ -103,7 +104,7 @@ class TestStatistics:
     @pytest.mark.parametrize("order", [2, 3])
     def test_of_a_zernike_term_on_a_spiral(self, spiral, order):
         x, y = spiral
-        found = form.statistics(zernike(x, y, order), form.spiral_weights(x, y))
+        found = form.statistics(zernike(x, y, order), area_weights(x, y))
         assert found.points == 200_000
         assert found.peak_to_valley == pytest.approx(2 * AMPLITUDE, rel=2e-2)
         assert found.rms_area_weighted == pytest.approx(disk_rms(order), rel=1e-3)
@@ -138,27 +139,6 @@ class TestStatistics:
     def test_nothing_is_refused(self):
         with pytest.raises(DataError, match="deviation is empty"):
             form.statistics(np.empty(0), np.empty(0))
-
-
-class TestWeights:
-    def test_density_agrees_with_the_spiral(self, spiral):
-        x, y = spiral
-        error = zernike(x, y, 2)
-        density = form.statistics(error, form.density_weights(x, y))
-        assert density.rms_area_weighted == pytest.approx(disk_rms(2), rel=2e-2)
-
-    def test_have_mean_one(self, spiral):
-        for weights in (form.spiral_weights(*spiral), form.density_weights(*spiral)):
-            assert np.mean(weights) == pytest.approx(1.0)
-
-    def test_of_points_in_one_place_are_alike(self):
-        here = np.zeros(4)
-        assert form.spiral_weights(here, here) == pytest.approx(1.0)
-        assert form.density_weights(here, here) == pytest.approx(1.0)
-
-    def test_no_cells_are_refused(self, spiral):
-        with pytest.raises(DataError, match="cells is 0"):
-            form.density_weights(*spiral, cells=0)
 
 
 class TestProfiles:
@@ -221,7 +201,7 @@ def test_a_gain_on_the_travel_shows_as_its_share_of_the_sag(spiral):
     sag = PAPER_MIRROR.height(x, y)
     assert RADIUS == PAPER_MIRROR_RADIUS_M
     error = form.deviation(x, y, sag * 1.26 / 1.27, PAPER_MIRROR)
-    found = form.statistics(form.level(x, y, error), form.spiral_weights(x, y))
+    found = form.statistics(form.level(x, y, error), area_weights(x, y))
     assert found.peak_to_valley == pytest.approx(np.ptp(sag) / 127)
     assert found.peak_to_valley == pytest.approx(8.9e-6, rel=0.01)
 
@@ -237,7 +217,7 @@ class TestRunningStatistics:
         for start in range(0, 1000, portion):
             part = slice(start, start + portion)
             running.add(x[part], y[part], deviation[part])
-        weights = form.spiral_weights(x, y)
+        weights = area_weights(x, y)
         whole = form.statistics(form.level(x, y, deviation, weights=weights), weights)
         found = running.statistics()
         assert found.points == 1000

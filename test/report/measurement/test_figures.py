@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
@@ -16,7 +17,7 @@ from omsm_ros.twin.plant import Plant
 
 @pytest.fixture(scope="module")
 def deviations(cloud):
-    weights = form.spiral_weights(cloud.x, cloud.y)
+    weights = area_weights(cloud.x, cloud.y)
     return {
         name: form.level(
             cloud.x,

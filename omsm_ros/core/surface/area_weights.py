@@ -1,0 +1,74 @@
+"""For how much of the surface does each point of a scan stand?
+
+Read off the scan as it ran. Where the path turns about the spindle, each ring of equal area
+counts alike, whatever the feed and the speed were while it was crossed. Elsewhere each cell of
+a grid counts alike that is as fine as the tracks allow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
+
+# A raster passes the axis now on this side, now on that, and never gets around it twice.
+_LEAST_TURNS = 2.0
+# Rings so fine that the rim is a thousandth of the area, of points enough for a mean.
+_MOST_RINGS, _POINTS_PER_RING = 2048, 20
+# The side of a grid; the number of its cells falls to a quarter as their size doubles where they
+# fill the surface, and to a half where they lie along single tracks.
+_MOST_CELLS, _FILLED = 512, 3.5
+
+
+def area_weights(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the area that each point of a scan, in its order, stands for (n,), of mean 1."""
+    group, area = _rings(x, y) if turns(x, y) >= _LEAST_TURNS else _cells(x, y)
+    points = np.bincount(group, minlength=len(area))
+    weights = (area / np.maximum(points, 1))[group]
+    return np.asarray(weights / np.mean(weights), np.float64)
+
+
+def turns(x: FloatArray, y: FloatArray) -> float:
+    """Return how many times the path gets around the origin."""
+    if len(x) < 2:
+        return 0.0
+    angle = np.unwrap(np.arctan2(y, x))
+    return float(abs(angle[-1] - angle[0]) / (2 * np.pi))
+
+
+def _rings(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the ring of each point (n,), and the areas of the rings (k,)."""
+    square = x**2 + y**2
+    inner, span = float(square.min()), float(np.ptp(square))
+    count = int(np.clip(len(x) // _POINTS_PER_RING, 1, _MOST_RINGS)) if span > 0 else 1
+    ring = ((square - inner) * (count / (span or 1.0))).astype(np.int64)
+    return np.minimum(ring, count - 1), np.ones(count)
+
+
+def _cells(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the cell of each point (n,), and the areas of the cells (k,).
+
+    A cell at the edge, which has an empty one beside it, is on average half covered.
+    """
+    # As fine as the points allow, if they lay evenly.
+    side = int(np.clip(np.sqrt(len(x)), 1, _MOST_CELLS))
+    size = max(np.ptp(x), np.ptp(y)) / side or 1.0
+    while side > 2 and _occupied(x, y, size) < _FILLED * _occupied(x, y, 2 * size):
+        side, size = side // 2, 2 * size
+    column, row = (_number(values, size) + 1 for values in (x, y))
+    shape = (int(column.max()) + 2, int(row.max()) + 2)
+    cell = np.asarray(column * shape[1] + row, np.int64)
+    filled = (np.bincount(cell, minlength=shape[0] * shape[1]) > 0).reshape(shape)
+    inside = filled.copy()
+    for axis in (0, 1):
+        inside &= np.roll(filled, 1, axis) & np.roll(filled, -1, axis)
+    return cell, np.where(inside, 1.0, 0.5).ravel()
+
+
+def _number(values: FloatArray, size: float) -> IntArray:
+    return np.asarray(np.floor((values - values.min()) / size), np.int64)
+
+
+def _occupied(x: FloatArray, y: FloatArray, size: float) -> int:
+    column, row = _number(x, size), _number(y, size)
+    return int(np.count_nonzero(np.bincount(column * (int(row.max()) + 1) + row)))

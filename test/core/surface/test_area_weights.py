@@ -1,0 +1,99 @@
+"""Areas of points against closed forms over disc and square, whatever path the scan took."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.surface.area_weights import area_weights, turns
+
+RADIUS = 12.7e-3
+Path = tuple[np.ndarray, np.ndarray]
+
+
+def polar(radius: np.ndarray, angle: np.ndarray) -> Path:
+    return radius * np.cos(angle), radius * np.sin(angle)
+
+
+def spiral(points: int = 100_000, count: float = 127.0) -> Path:
+    share = np.arange(points) / points
+    return polar(RADIUS * (1 - share), 2 * np.pi * count * share)
+
+
+def constant_surface_speed() -> Path:
+    share = np.arange(100_000) / 100_000
+    return polar(RADIUS * np.sqrt(1 - share), 2 * np.pi * 254 * (1 - np.sqrt(1 - share)))
+
+
+def feed_that_changes() -> Path:
+    # Three times as fast over the inner half, and a dwell of 300 rad at the rim.
+    radius = RADIUS * np.concatenate(
+        [np.ones(60_000), np.linspace(1.0, 0.5, 60_000), np.linspace(0.5, 0.0, 20_000)]
+    )
+    return polar(radius, np.linspace(0.0, 900.0, len(radius)))
+
+
+@pytest.mark.parametrize(
+    "path", [spiral, constant_surface_speed, feed_that_changes, lambda: spiral(9000, 30.0)]
+)
+@pytest.mark.parametrize(
+    ("form", "rms"),
+    [
+        # Over the unit disc: x² - y² has a mean square of 1/6, x of 1/4, r⁴ a variance of 4/45.
+        (lambda x, y: x**2 - y**2, np.sqrt(1 / 6)),
+        (lambda x, y: x, 0.5),
+        (lambda x, y: (x**2 + y**2) ** 2, np.sqrt(1 / 5 - 1 / 9)),
+    ],
+)
+def test_a_turning_scan_weighs_the_disc_as_it_is(path, form, rms) -> None:
+    x, y = path()
+    weights = area_weights(x, y)
+    value = form(x / RADIUS, y / RADIUS)
+    mean = np.average(value, weights=weights)
+    assert np.average((value - mean) ** 2, weights=weights) == pytest.approx(rms**2, rel=4e-3)
+
+
+def test_speed_and_feed_would_mislead_by_a_tenth() -> None:
+    x, y = constant_surface_speed()
+    assumed = np.hypot(x, y)
+    value = (x**2 - y**2) / RADIUS**2
+    assert np.sqrt(np.average(value**2, weights=assumed)) > 1.1 * np.sqrt(1 / 6)
+
+
+def raster(lines: int = 200, zigzag: bool = False, centre: float = 0.0) -> Path:
+    line = np.linspace(-RADIUS, RADIUS, 600)
+    turned = [line[:: -1 if zigzag and k % 2 else 1] for k in range(lines)]
+    rows = np.repeat(np.linspace(-RADIUS, RADIUS, lines), len(line))
+    return np.concatenate(turned) + centre, rows
+
+
+@pytest.mark.parametrize("options", [{}, {"zigzag": True}, {"centre": 0.1}])
+def test_a_raster_weighs_the_square_as_it_is(options) -> None:
+    x, y = raster(**options)
+    assert turns(x, y) < 2
+    value = (x - options.get("centre", 0.0)) / RADIUS
+    weights = area_weights(x, y)
+    assert np.average(value**2, weights=weights) == pytest.approx(1 / 3, rel=0.02)
+
+
+def test_lines_scanned_at_other_speeds_count_by_their_area() -> None:
+    x, y = raster()
+    # The upper half four times as slowly.
+    x, y = (np.concatenate([v[y <= 0], np.repeat(v[y > 0], 4)]) for v in (x, y))
+    weights = area_weights(x, y)
+    assert np.average(y > 0, weights=weights) == pytest.approx(0.5, abs=0.01)
+    assert np.mean(y > 0) > 0.75
+
+
+def test_they_have_mean_one_and_points_in_one_place_are_alike() -> None:
+    assert np.mean(area_weights(*spiral())) == pytest.approx(1.0)
+    assert np.mean(area_weights(*raster())) == pytest.approx(1.0)
+    here = np.zeros(4)
+    assert area_weights(here, here) == pytest.approx(1.0)
+    assert area_weights(here[:1], here[:1]) == pytest.approx(1.0)
+
+
+def test_turns_are_those_about_the_origin() -> None:
+    assert turns(*spiral()) == pytest.approx(127, abs=0.01)
+    x, y = spiral()
+    assert turns(x + 0.1, y) < 1
