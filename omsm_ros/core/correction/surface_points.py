@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -36,7 +36,7 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.sample)
 
-    def part(self, place: slice) -> SurfacePoints:
+    def part(self, place: slice | BoolArray) -> SurfacePoints:
         """The points at ``place``, without a stamp."""
         return SurfacePoints(**{name: getattr(self, name)[place] for name in _COLUMNS})
 

@@ -105,7 +105,7 @@ def runs() -> np.ndarray:
 def stated() -> SurfacePoints:
     points = correct(calibration(correlated_covariance()), Z, DISTANCE, SOURCES)
     keep = points.sample >= 200
-    return replace(points, **{f.name: getattr(points, f.name)[keep] for f in fields(points)})
+    return points.part(keep)
 
 
 def test_stated_uncertainty_is_that_of_monte_carlo_point_by_point(runs: np.ndarray) -> None:
