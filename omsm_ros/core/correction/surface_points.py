@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,12 @@ class SurfacePoints:
         return SurfacePoints(**{name: getattr(self, name)[place] for name in _COLUMNS})
 
 
-_COLUMNS = ("sample", "x", "y", "height", "dynamic_error", "uncertainty", "intensity")
+_COLUMNS = tuple(field.name for field in fields(SurfacePoints) if field.name != "stamp_ns")
+_KINDS = {"sample": np.int64, "intensity": np.float32}
+_NO_POINTS = SurfacePoints(
+    **{name: np.empty(0, _KINDS.get(name, np.float64)) for name in _COLUMNS},
+    stamp_ns=0,
+)
 
 
 def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
@@ -49,17 +54,6 @@ def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
     present = [part for part in parts if part is not None and len(part)] or [_NO_POINTS]
     columns = {name: np.concatenate([getattr(p, name) for p in present]) for name in _COLUMNS}
     return SurfacePoints(**columns, stamp_ns=present[0].stamp_ns)
-
-
-_NO_POINTS = SurfacePoints(
-    sample=np.empty(0, np.int64),
-    x=np.empty(0),
-    y=np.empty(0),
-    height=np.empty(0),
-    dynamic_error=np.empty(0),
-    uncertainty=np.empty(0),
-    intensity=np.empty(0, np.float32),
-)
 
 
 CLOUD_FIELDS: tuple[tuple[str, str], ...] = (
