@@ -78,6 +78,10 @@ class Problem:
         omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
         return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
 
+    def parametrised(self, structure: Structure) -> Scaled:
+        """Return how ``structure`` is parametrised over ``s``."""
+        return Scaled(structure, self.rate)
+
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """What drives the system: spectra (k,), each with its number of numerator terms."""
         motion = (self._spectrum, structure.zeros + 1)
@@ -262,7 +266,7 @@ class _Cache:
 
 def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
     """The best local minimum from ``starts``, each a ψ; all race, the best of them finishes."""
-    scaled = Scaled(structure, problem.rate)
+    scaled = problem.parametrised(structure)
     cache = _Cache(problem, scaled)
     best, best_cost = starts[0], np.inf
     for start in starts:

@@ -1,0 +1,128 @@
+"""Where the fit of a sampled model starts: poles by ARX, instrumental variables, and subspace.
+
+Each finds what the others miss: least squares of an ARX model a well-damped response in little
+noise, instruments the same in coloured noise, a subspace the modes of a high order at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import signal
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.least_squares import least_squares
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+
+# Steiglitz and McBride (1965): it has converged, or will not.
+_ITERATIONS = 8
+# Rows of past and of future beyond the highest order.
+_SPARE_ROWS = 5
+_MAX_COLUMNS = 5000
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteStarts:
+    """Proposes poles in z for a record ``input``, ``output`` (n,), compared where ``used`` (n,).
+
+    order: the highest that will be asked for
+    """
+
+    input: FloatArray
+    output: FloatArray
+    used: BoolArray
+    order: int
+
+    def poles(self, order: int) -> list[ComplexArray]:
+        """Return proposals of ``order`` poles each, conjugates included."""
+        found = [self._arx(order), *self._iterated(order)]
+        subspace = self._subspace(order)
+        return found if subspace is None else [*found, subspace]
+
+    @cached_property
+    def _filled(self) -> FloatArray:
+        index = np.arange(len(self.used))
+        return np.interp(index, index[self.used], self.output[self.used])
+
+    def _rows(self, order: int) -> BoolArray:
+        """True where the sample and ``order`` before it are all used, shape (n - order,)."""
+        return np.asarray(np.all(sliding_window_view(self.used, order + 1), axis=1))
+
+    def _regressors(
+        self, u: FloatArray, y: FloatArray, order: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Columns -y[k-1] … -y[k-n], u[k] … u[k-n], 1 and the target y[k], where all are used."""
+        rows = self._rows(order)
+        past = sliding_window_view(y, order + 1)[rows][:, ::-1]
+        drive = sliding_window_view(u, order + 1)[rows][:, ::-1]
+        return np.column_stack([-past[:, 1:], drive, np.ones(len(drive))]), past[:, 0]
+
+    def _arx(self, order: int) -> ComplexArray:
+        columns, target = self._regressors(self.input, self._filled, order)
+        return _poles(least_squares(columns, target)[:order])
+
+    def _iterated(self, order: int) -> list[ComplexArray]:
+        """By instruments, then by Steiglitz and McBride's iteration, from the ARX model."""
+        columns, target = self._regressors(self.input, self._filled, order)
+        found = least_squares(columns, target)
+        try:
+            simulated = signal.lfilter(
+                found[order:-1], np.poly(_inside(_poles(found[:order]))).real, self.input
+            )
+            instruments, _ = self._regressors(self.input, simulated, order)
+            by_instruments = np.linalg.solve(instruments.T @ columns, instruments.T @ target)
+        except np.linalg.LinAlgError:
+            return []
+        poles = _poles(by_instruments[:order])
+        return [p for p in (poles, self._prefiltered(order, poles)) if len(p) == order]
+
+    def _prefiltered(self, order: int, poles: ComplexArray) -> ComplexArray:
+        for _ in range(_ITERATIONS):
+            denominator = np.poly(_inside(poles)).real
+            u, y = (
+                signal.lfilter([1.0], denominator, values) for values in (self.input, self._filled)
+            )
+            columns, target = self._regressors(u, y, order)
+            if not np.all(np.isfinite(columns)):
+                break
+            poles = _poles(least_squares(columns, target)[:order])
+        return poles
+
+    @cached_property
+    def _observability(self) -> tuple[FloatArray, FloatArray] | None:
+        """Singular vectors and values of the future output, past as instrument (PO-MOESP)."""
+        rows = self.order + _SPARE_ROWS
+        if len(self.used) < 4 * rows:
+            return None
+        places = np.flatnonzero(np.all(sliding_window_view(self.used, 2 * rows), axis=1))
+        if len(places) < 6 * rows:
+            return None
+        places = places[:: -(-len(places) // _MAX_COLUMNS)]
+        u, y = (sliding_window_view(v, 2 * rows)[places] for v in (self.input, self._filled))
+        stacked = np.concatenate([u[:, rows:], u[:, :rows], y[:, :rows], y[:, rows:]], axis=1)
+        lower = np.asarray(np.linalg.qr(stacked - np.mean(stacked, axis=0), mode="r")).T
+        left, values, _ = np.linalg.svd(lower[3 * rows :, rows : 3 * rows])
+        return left, values
+
+    def _subspace(self, order: int) -> ComplexArray | None:
+        found = self._observability
+        if found is None:
+            return None
+        basis = found[0][:, :order] * np.sqrt(found[1][:order])
+        return np.asarray(np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:], rcond=None)[0]))
+
+
+def _poles(coefficients: FloatArray) -> ComplexArray:
+    """Poles in z of 1 + a1 q + … + an q^n."""
+    if not np.all(np.isfinite(coefficients)):
+        return np.empty(0, np.complex128)
+    return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
+
+
+def _inside(poles: ComplexArray) -> ComplexArray:
+    """``poles`` with those outside the unit circle reflected into it."""
+    outside = np.abs(poles) > 1
+    return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)

@@ -1,0 +1,292 @@
+"""Which sampled model predicts best what it has not seen? Judged by free runs.
+
+Orders are fitted to the first part of the record and run freely over the rest. The few that
+predict it best are then judged on several hidden parts, as they are and with their residual
+whitened, which is efficient only for a model that holds all the dynamics. Of those that
+predict equally well the plainest is taken: poles to spare would follow a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.fitting.covariance import autoregression
+from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
+from omsm_ros.core.fitting.held_problem import RATE_SAMPLES, DiscreteScaled, HeldProblem
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.output_error import Fit, fit
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.errors import IdentificationError
+
+MAX_ORDER = 20
+# Parts of the used samples; all but the first are hidden once, and the last three together.
+_PARTS = 6
+# Part of the used samples to which every order is fitted first.
+_FIRST_PART = 0.75
+# Orders that are judged on every hidden part: so many of the lowest whose error over the last
+# part is within this factor of the least. One part alone misjudges by about as much.
+_FINALISTS = 4
+_ABOUT_AS_GOOD = 2.0
+# So many orders in a row that predict no better than the best so far end the search.
+_FRUITLESS = 5
+# Order of the model by which the delay is chosen.
+_DELAY_ORDER = 3
+# Samples for each parameter: with fewer, an order is not tried.
+_LEAST_SAMPLES_EACH = 3
+# Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
+_FAST = float(np.log(0.1))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledCandidate:
+    """A fit to all used samples, and how it predicts.
+
+    order: poles;  whitened: fitted with its residual made white
+    hidden: mean square error of free runs over each hidden part (folds,), empty if not judged
+    """
+
+    problem: HeldProblem
+    fit: Fit
+    order: int
+    whitened: bool
+    hidden: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SampledChoice:
+    """chosen: of the order asked for, or freely;  free: the free choice
+    delay: whole samples;  by_order: mean square error [unit²] over the last part, of each order
+    """
+
+    chosen: SampledCandidate
+    free: SampledCandidate
+    delay: int
+    by_order: FloatArray
+
+
+def parameters(order: int) -> int:
+    """Number of parameters: denominator, numerator, initial state and offset."""
+    return 3 * order + 3
+
+
+def choose_sampled(
+    input: FloatArray,
+    output: FloatArray,
+    used: BoolArray,
+    period: float,
+    *,
+    order: int = 0,
+    max_delay: int = 0,
+) -> SampledChoice:
+    """Fit sampled models of ``input`` to ``output`` (n,) where ``used`` (n,), and choose.
+
+    order: number of poles, 0 to choose;  max_delay: whole samples to try
+
+    Raises IdentificationError when too few samples are used for the order asked for, for an
+    order beyond MAX_ORDER, or where a value is not finite.
+    """
+    most = _highest_order(int(np.sum(used)), order)
+    if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
+        raise IdentificationError("a value of input or output is not finite where it is used")
+    centred = np.where(used, output - np.mean(output[used]), 0.0)
+    delay = _best_delay(input, centred, used, period, max_delay)
+    problem = _delayed(input, centred, used, period, delay)
+    part = _parts(problem.used)
+    early = replace(problem, used=problem.used & (part < _FIRST_PART * _PARTS))
+    late = problem.used & ~early.used
+    fits, by_order = _explored(early, late, most, order)
+    finalists = _finalists(by_order, order)
+    tried = [
+        SampledCandidate(problem, _refitted(problem, fits[n], white), n, white, np.empty(0))
+        for n in finalists
+        for white in ((False, True) if n else (False,))
+    ]
+    judged = [replace(c, hidden=_hidden_errors(c, part)) for c in tried]
+    starts = DiscreteStarts(problem.input, problem.output, problem.used, most)
+    free = _finished(_plainest(judged), starts)
+    chosen = free
+    if order and order != free.order:
+        chosen = _finished(_plainest([c for c in judged if c.order == order]), starts)
+    return SampledChoice(chosen, free, delay, by_order)
+
+
+def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
+    """The candidate at the best minimum that starts from all used samples lead to."""
+    if candidate.order == 0 or candidate.whitened:
+        return candidate
+    every = [candidate.fit.nonlinear, *_proposed(candidate.problem, candidate.order, starts)]
+    return replace(candidate, fit=fit(candidate.problem, candidate.fit.structure, every))
+
+
+def _proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
+    """ψ of what ``starts`` propose for ``order``, as far as they are any."""
+    scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
+    proposed = [scaled.of_discrete(poles) for poles in starts.poles(order)]
+    return [p for p in proposed if len(p) == order and np.all(np.isfinite(p))]
+
+
+def _highest_order(samples: int, order: int) -> int:
+    if not 0 <= order <= MAX_ORDER:
+        raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_ORDER}")
+    needed = _LEAST_SAMPLES_EACH * parameters(max(order, 1))
+    if samples < needed:
+        raise IdentificationError(
+            f"{samples!r} samples are used, at least {needed} are needed for order "
+            f"{max(order, 1)}; record more, or ask for a lower order"
+        )
+    return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
+
+
+def _parts(used: BoolArray) -> FloatArray:
+    """Number of the part, 0 to _PARTS, a used sample is in, with fractions; -1 elsewhere."""
+    return np.where(used, (np.cumsum(used) - 1) * _PARTS / max(np.sum(used), 1), -1.0)
+
+
+def _delayed(
+    input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
+) -> HeldProblem:
+    late = np.roll(input, delay)
+    return HeldProblem(
+        input=late - np.mean(late),
+        output=output,
+        used=used & (np.arange(len(used)) >= delay),
+        period=period,
+        background=np.ones((len(output), 1)),
+        rate=RATE_SAMPLES / period,
+    )
+
+
+def _best_delay(
+    input: FloatArray, output: FloatArray, used: BoolArray, period: float, most: int
+) -> int:
+    """Whole samples by which a small model is best late."""
+    if most == 0:
+        return 0
+    same = used & (np.arange(len(used)) >= most)
+    left = []
+    for delay in range(most + 1):
+        problem = _delayed(input, output, same, period, delay)
+        starts = DiscreteStarts(problem.input, problem.output, problem.used, _DELAY_ORDER)
+        fits: list[Fit] = []
+        for _ in range(_DELAY_ORDER + 1):
+            fits.append(_next_order(problem, fits, starts))
+        left.append(fits[-1].sum_of_squares)
+    return int(np.argmin(left))
+
+
+def _explored(
+    early: HeldProblem, late: BoolArray, most: int, at_least: int
+) -> tuple[list[Fit], FloatArray]:
+    """Fits of rising order, and how they predict ``late``; until some in a row predict no better.
+
+    at_least: order to go to in any case
+    """
+    fits: list[Fit] = []
+    errors: list[float] = []
+    starts = DiscreteStarts(early.input, early.output, early.used, most)
+    for order in range(most + 1):
+        fits.append(_next_order(early, fits, starts))
+        errors.append(_missed(early, fits[-1], late))
+        if order - int(np.argmin(errors)) >= _FRUITLESS and order >= at_least:
+            break
+    return fits, np.array(errors)
+
+
+def _next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
+    """Best fit with as many poles as there are ``smaller`` fits, from none on."""
+    order = len(smaller)
+    structure = Structure(order, order, False)
+    if order == 0:
+        return fit(problem, structure, [np.empty(0)])
+    grown = _grown([f.nonlinear for f in smaller], len(problem.output))
+    return fit(problem, structure, _proposed(problem, order, starts) + grown)
+
+
+def _grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
+    """Starts for one pole more than the last of ``smaller``.
+
+    A pole too fast to be seen, so that richer never fits worse; and two as slow as the record
+    is long: from afar, a pair of integrators is behind a crest of the error.
+    """
+    slow = np.log(samples / 2)
+    fast = [_with_pole(smaller[-1], _FAST)]
+    return fast + [_with_pole(_with_pole(found, slow), slow) for found in smaller[-2:-1]]
+
+
+def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
+    """ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
+    pairs, odd = divmod(len(nonlinear), 2)
+    first, second = nonlinear[:pairs], nonlinear[pairs + odd :]
+    if not odd:
+        return np.concatenate([first, [log_time], second])
+    merged = np.logaddexp(nonlinear[pairs], log_time)
+    return np.concatenate([first, [merged], second, [nonlinear[pairs] + log_time]])
+
+
+def _refitted(problem: HeldProblem, start: Fit, whitened: bool) -> Fit:
+    """The structure of ``start`` fitted to ``problem``, its residual made white if wanted."""
+    found = fit(problem, start.structure, [start.nonlinear])
+    if not whitened:
+        return found
+    whitener, _ = autoregression(found.residual)
+    if len(whitener) == 1:
+        return found
+    apart = np.arange(len(problem.used)) >= len(whitener)
+    lost = np.convolve(~problem.used, np.ones(len(whitener)))[: len(problem.used)] > 0.5
+    white = replace(
+        problem,
+        input=signal.lfilter(whitener, 1.0, problem.input),
+        output=signal.lfilter(whitener, 1.0, problem.output),
+        used=problem.used & apart & ~lost,
+    )
+    return fit(white, start.structure, [found.nonlinear])
+
+
+def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
+    """Mean square error of a free run over samples that are not used in ``problem``."""
+    missed = (problem.output - problem.free_run(fitted))[hidden]
+    value = float(np.mean(missed**2))
+    return value if np.isfinite(value) else np.inf
+
+
+def _finalists(by_order: FloatArray, order: int) -> list[int]:
+    """The static model, the lowest orders about as good as the best, the best, and ``order``."""
+    about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))
+    best = np.argsort(by_order, kind="stable")[:2]
+    return sorted({0, order, *about_as_good[:_FINALISTS].tolist(), *best.tolist()})
+
+
+def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
+    """Mean square error over each hidden part, the candidate fitted without it.
+
+    A model is asked to bridge a part and to run on beyond the data; either alone misjudges:
+    a plant that drifts is held at both ends of a bridge. None is asked to run backwards.
+    """
+    problem, number = candidate.problem, np.floor(part)
+    hidden = [number == i for i in range(1, _PARTS)]
+    hidden += [number >= i for i in range(_PARTS // 2, _PARTS - 1)]
+    errors = []
+    for samples in hidden:
+        rest = replace(problem, used=problem.used & ~samples)
+        found = _refitted(rest, candidate.fit, candidate.whitened)
+        errors.append(_missed(rest, found, samples))
+    return np.array(errors)
+
+
+def _plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
+    """Of those as good as the best, the plainest: not whitened, then with fewest poles.
+
+    As good: worse in the mean by no more than one standard error of the difference (Breiman
+    et al. 1984, paired).
+    """
+    errors = np.array([c.hidden for c in judged])
+    mean = np.mean(errors, axis=1)
+    with np.errstate(invalid="ignore"):
+        worse = errors - errors[int(np.argmin(mean))]
+        allowed = np.std(worse, axis=1, ddof=1) / np.sqrt(errors.shape[1])
+        close = np.flatnonzero(np.mean(worse, axis=1) <= allowed)
+    return judged[min(close, key=lambda i: (judged[i].whitened, judged[i].order, mean[i]))]

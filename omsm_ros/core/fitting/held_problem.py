@@ -1,0 +1,136 @@
+"""Fit a rational H(z) to an input that is held between samples, such as a drive's command.
+
+A linear system behind a zero-order or a first-order hold is exactly rational in z⁻¹, with as
+many poles as the system has, and from its initial state on it is known exactly too: that
+adds a polynomial over the same denominator. So the fit of :mod:`output_error` serves with
+q = z⁻¹ for s. The denominator is a product of sections of
+``w = (2/T) (1 - q)/(1 + q)``, so every parameter vector is stable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import fft
+
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.least_squares import least_squares
+from omsm_ros.core.fitting.model_structure import Scaled, Structure
+from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.samples.blocks import FloatArray
+
+# w over the rate of a section, per (1 - q)/(1 + q), where the rate is half the sampling rate:
+# half way between the slowest and the fastest that a sampled pole can be.
+_PER_BILINEAR = 4.0
+RATE_SAMPLES = 0.5
+# A pole is kept this far inside the unit circle and off z = -1, where w is infinite.
+_OFF_BORDER = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteScaled(Scaled):
+    """Sections in w of a denominator in q; numerators are polynomials in q."""
+
+    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """1 / denominator (k,), and d ln of it / dψ (len ψ, k), at q = ``s`` (k,)."""
+        up, down = 1 + s, _PER_BILINEAR * (1 - s)
+        denominator = np.ones_like(s)
+        first, second = [], []
+        for section in self.sections(nonlinear):
+            if len(section) == 3:
+                square = section[2] * down * down
+                linear = section[1] * down * up
+                value = up * up + linear + square
+                second.append(-square / value)
+            else:
+                linear = section[1] * down
+                value = up + linear
+            first.append(-linear / value)
+            denominator = denominator * value
+        relative = np.array(first + second, np.complex128)
+        return 1 / denominator, relative.reshape(-1, len(s))
+
+    def polynomials(self, nonlinear: FloatArray) -> list[FloatArray]:
+        """Factors of the denominator, ascending in q."""
+        up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
+        found = []
+        for section in self.sections(nonlinear):
+            size = len(section) - 1
+            terms = (
+                value
+                * polynomial.polymul(polynomial.polypow(down, i), polynomial.polypow(up, size - i))
+                for i, value in enumerate(section)
+            )
+            found.append(np.asarray(sum(terms), np.float64))
+        return found
+
+    def of_discrete(self, poles: ComplexArray) -> FloatArray:
+        """Return ψ of ``poles`` in z (n,), conjugates included; unstable ones are reflected."""
+        outside = np.abs(poles) > 1
+        inside = np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
+        inside = inside * (1 - _OFF_BORDER)
+        return self.nonlinear_of(_PER_BILINEAR * (inside - 1) / (inside + 1), 0.0)
+
+
+class HeldProblem(Problem):
+    """A problem whose input is held between samples; ``s`` is q = z⁻¹, the rate 0.5 / period."""
+
+    @cached_property
+    def closed_length(self) -> int:
+        """Samples of the record: a held input needs no bridge back to its start."""
+        return len(self.input)
+
+    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,) as they are, shape (k,)."""
+        return np.asarray(fft.rfft(values), np.complex128)
+
+    @cached_property
+    def _spectrum(self) -> ComplexArray:
+        return self.closed_spectrum(self.input)
+
+    @cached_property
+    def s(self) -> ComplexArray:
+        """q = exp(-jωT) of the transform, (k,)."""
+        angle = 2 * np.pi * fft.rfftfreq(self.closed_length)
+        return np.asarray(np.exp(-1j * angle), np.complex128)
+
+    def parametrised(self, structure: Structure) -> DiscreteScaled:
+        """Return how ``structure`` is parametrised over q."""
+        return DiscreteScaled(structure, self.rate)
+
+    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
+        """The input, and a pulse at the first sample whose terms make any initial state.
+
+        n of them do from the second sample on, and one more sets the first free.
+        """
+        pulse = np.ones(len(self.s), np.complex128)
+        return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles + 1)]
+
+    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
+        """Without their mean, which the offset replaces: an integrator's would drown the rest."""
+        spectra = super()._driven(structure, lag)
+        spectra[:, 0] = 0.0
+        return spectra
+
+    def columns(self, fitted: Fit) -> FloatArray:
+        """d output / d(terms of the numerator, ψ, initial state, background), shape (k, …)."""
+        lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
+        driven = self._driven(fitted.structure, lag)
+        terms = fitted.structure.zeros + 1
+        by_nonlinear = relative * (fitted.driven @ driven)
+        every = np.concatenate([driven[:terms], by_nonlinear, driven[terms:]])
+        return np.column_stack([self._in_time(every).T, self._fixed])
+
+    def free_run(self, fitted: Fit) -> FloatArray:
+        """Output (n,) of the dynamics of ``fitted``, initial state and offset found anew."""
+        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        spectra = self._driven(fitted.structure, lag)
+        terms = fitted.structure.zeros + 1
+        columns = fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T
+        moved = columns[:, :terms] @ fitted.driven[:terms]
+        free = np.column_stack([columns[:, terms:], self.background])
+        state = least_squares(free[self.used], (self.output - moved)[self.used])
+        return np.asarray(moved + free @ state)
