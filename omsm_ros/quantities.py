@@ -129,6 +129,8 @@ _MAX_STAMP_NS = 2**31 * 10**9
 STAMP = Quantity(
     "stamp", "ns", -_MAX_STAMP_NS, _MAX_STAMP_NS, "set the clock of the sender", whole=True
 )
+# Any quantity in any unit: its square, summed over a record, stays finite.
+SIGNAL = Quantity("signal", "", -1e100, 1e100, "scale it")
 POSITION = Quantity("position", "m", -100.0, 100.0, "give it in metres")
 DISTANCE = Quantity("distance", "m", -100.0, 100.0, "give it in metres")
 # A spindle's angle is counted on over its turns: a year at 30 rpm makes 1e8 rad.
@@ -147,6 +149,7 @@ TIME_CONSTANT = Quantity("time constant", "s", 1e-10, 1000.0, "identify again")
 FREQUENCY = Quantity("frequency", "Hz", 1e-6, 1e9, "give it in hertz")
 # Coefficients of s^k are these powers of time; beyond them their products overflow.
 GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and probe")
+MAX_DELAY_SAMPLES = Quantity("longest delay", "samples", 0, 50, "0 = none", whole=True)
 ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
 
 # ------------------------------------------------------------------- machine and surface

@@ -1,4 +1,4 @@
-"""Commands around a calibration: plan, identify, verify, compare."""
+"""Commands around a calibration: plan, verify, compare."""
 
 from __future__ import annotations
 
@@ -10,95 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
-from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
-from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability
-from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.verify_calibration import path_check_of
-from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import save_text
-from omsm_ros.units import DEGREE_RAD, MICROSECOND_S, NANOMETRE_M
-
-# ------------------------------------------------------------------------------ identify
-
-
-def _declare_identify(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path, help="a step test, or any motion, on a fixed target")
-    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument(
-        "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
-    )
-    sub.add_argument("--input", choices=("encoder", "reference"), default="encoder")
-    sub.add_argument(
-        "--duration", type=number(quantities.DURATION), default=0.0, help="[s] to use; 0 = all"
-    )
-    sub.add_argument(
-        "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
-    )
-    sub.add_argument(
-        "--report", type=Path, metavar="DIR", help="write the certificate: HTML, Markdown, plots"
-    )
-
-
-def _identify(args: argparse.Namespace) -> Facts:
-    with progress_bar("reading", args.json) as progress:
-        motion = motion_of_bag(args.bag, duration=args.duration, progress=progress)
-    identified = identify(motion, order=args.order, input=args.input, settings=args.settings)
-    facts = calibration_facts(identified.calibration)
-    # A rejected calibration never takes the place of a good one.
-    rejected = args.out.parent / f"{args.out.stem}.rejected.json"
-    path = rejected if facts["verdict"] == REJECTED else args.out
-    save_calibration(path, identified.calibration)
-    facts["calibration"] = str(path)
-    if args.report is not None:
-        # Drawing takes a second to import; most commands do without.
-        from omsm_ros.jobs.certify import write_certificate
-
-        page = write_certificate(args.report, identified, source=args.bag.name)
-        facts["report"] = str(page)
-    return facts
-
-
-def calibration_facts(calibration: Calibration) -> Facts:
-    """What a calibration says in a few words."""
-    verdict, reasons = verdict_of(calibration)
-    return {
-        "id": calibration.id,
-        "verdict": verdict,
-        "reasons": reasons,
-        "warnings": calibration.certificate.get("warnings", []),
-        "order": len(calibration.dynamics.denominator) - 1,
-        "low_frequency_delay": calibration.dynamics.low_frequency_delay,
-        "static_gain": calibration.static_gain,
-        "valid_up_to": calibration.valid_up_to,
-    }
-
-
-def _not_identified(facts: Facts) -> str:
-    if facts["verdict"] != REJECTED:
-        return ""
-    return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {facts['calibration']!r}"
-
-
-def _show_identify(facts: Facts) -> None:
-    rows = [
-        ("verdict", facts["verdict"]),
-        ("order", str(facts["order"])),
-        ("low-frequency delay", f"{facts['low_frequency_delay'] / MICROSECOND_S:.2f} µs"),
-        ("static gain", f"{facts['static_gain']:.6f}"),
-        ("valid up to", f"{facts['valid_up_to']:.1f} Hz"),
-    ]
-    for kind in ("reasons", "warnings"):
-        rows += [(kind.removesuffix("s"), text) for text in facts[kind]]
-    rows.append(("written to", facts["calibration"]))
-    if "report" in facts:
-        rows.append(("certificate", facts["report"]))
-    table(rows)
-
+from omsm_ros.units import DEGREE_RAD, NANOMETRE_M
 
 # -------------------------------------------------------------------------------- verify
 
@@ -226,14 +146,6 @@ def _show_plan(facts: Facts) -> None:
 
 COMMANDS = (
     Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
-    Command(
-        "identify",
-        "identify G_m from a recording",
-        _declare_identify,
-        _identify,
-        _show_identify,
-        _not_identified,
-    ),
     Command(
         "verify",
         "check a calibration on a free path: errors and phase lags before and after",

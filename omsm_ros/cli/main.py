@@ -26,7 +26,8 @@ WORDS = {
     "omsm_ros.cli.measuring": ("inspect", "predict", "correct"),
     "omsm_ros.cli.resolving": ("selfcal", "reversal", "latency"),
     "omsm_ros.cli.aligning": ("align",),
-    "omsm_ros.cli.calibrating": ("plan", "identify", "verify", "compare"),
+    "omsm_ros.cli.identifying": ("identify",),
+    "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
 }
 
 

@@ -45,7 +45,7 @@ class DiscreteStarts:
     @cached_property
     def _filled(self) -> FloatArray:
         index = np.arange(len(self.used))
-        return np.interp(index, index[self.used], self.output[self.used])
+        return np.asarray(np.interp(index, index[self.used], self.output[self.used]))
 
     def _rows(self, order: int) -> BoolArray:
         """True where the sample and ``order`` before it are all used, shape (n - order,)."""
@@ -73,7 +73,9 @@ class DiscreteStarts:
                 found[order:-1], np.poly(_inside(_poles(found[:order]))).real, self.input
             )
             instruments, _ = self._regressors(self.input, simulated, order)
-            by_instruments = np.linalg.solve(instruments.T @ columns, instruments.T @ target)
+            by_instruments = np.asarray(
+                np.linalg.solve(instruments.T @ columns, instruments.T @ target), np.float64
+            )
         except np.linalg.LinAlgError:
             return []
         poles = _poles(by_instruments[:order])

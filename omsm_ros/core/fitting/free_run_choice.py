@@ -27,9 +27,9 @@ MAX_ORDER = 20
 _PARTS = 6
 # Part of the used samples to which every order is fitted first.
 _FIRST_PART = 0.75
-# Orders that are judged on every hidden part: so many of the lowest whose error over the last
-# part is within this factor of the least. One part alone misjudges by about as much.
-_FINALISTS = 4
+# Orders that are judged on every hidden part: so many of the best over the last part, and of
+# the lowest within this factor of the least error. One part alone misjudges by about as much.
+_FINALISTS = 3
 _ABOUT_AS_GOOD = 2.0
 # So many orders in a row that predict no better than the best so far end the search.
 _FRUITLESS = 5
@@ -37,6 +37,8 @@ _FRUITLESS = 5
 _DELAY_ORDER = 3
 # Samples for each parameter: with fewer, an order is not tried.
 _LEAST_SAMPLES_EACH = 3
+# Sixty columns of them, and their spectra, take a third of a gigabyte.
+_MOST_SAMPLES = 200_000
 # Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
 _FAST = float(np.log(0.1))
 
@@ -90,6 +92,8 @@ def choose_sampled(
     order beyond MAX_ORDER, or where a value is not finite.
     """
     most = _highest_order(int(np.sum(used)), order)
+    if np.ptp(input) == 0:
+        raise IdentificationError("the input never changes; excite it while recording")
     if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
         raise IdentificationError("a value of input or output is not finite where it is used")
     centred = np.where(used, output - np.mean(output[used]), 0.0)
@@ -132,6 +136,11 @@ def _proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[
 def _highest_order(samples: int, order: int) -> int:
     if not 0 <= order <= MAX_ORDER:
         raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_ORDER}")
+    if samples > _MOST_SAMPLES:
+        raise IdentificationError(
+            f"{samples!r} samples are used, at most {_MOST_SAMPLES} fit into memory beside their "
+            "derivatives; give a shorter --duration"
+        )
     needed = _LEAST_SAMPLES_EACH * parameters(max(order, 1))
     if samples < needed:
         raise IdentificationError(
@@ -143,7 +152,8 @@ def _highest_order(samples: int, order: int) -> int:
 
 def _parts(used: BoolArray) -> FloatArray:
     """Number of the part, 0 to _PARTS, a used sample is in, with fractions; -1 elsewhere."""
-    return np.where(used, (np.cumsum(used) - 1) * _PARTS / max(np.sum(used), 1), -1.0)
+    place = np.cumsum(used) - 1.0
+    return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
 
 
 def _delayed(
@@ -254,10 +264,10 @@ def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
 
 
 def _finalists(by_order: FloatArray, order: int) -> list[int]:
-    """The static model, the lowest orders about as good as the best, the best, and ``order``."""
-    about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))
-    best = np.argsort(by_order, kind="stable")[:2]
-    return sorted({0, order, *about_as_good[:_FINALISTS].tolist(), *best.tolist()})
+    """Orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
+    best = np.argsort(by_order, kind="stable")[:_FINALISTS]
+    about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))[:_FINALISTS]
+    return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
 
 
 def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
@@ -278,15 +288,16 @@ def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
 
 
 def _plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
-    """Of those as good as the best, the plainest: not whitened, then with fewest poles.
+    """Of those that no other beats, the plainest: not whitened, then with fewest poles.
 
-    As good: worse in the mean by no more than one standard error of the difference (Breiman
-    et al. 1984, paired).
+    One beats another that is better in the mean by more than one standard error of their
+    difference (Breiman et al. 1984, paired).
     """
     errors = np.array([c.hidden for c in judged])
-    mean = np.mean(errors, axis=1)
     with np.errstate(invalid="ignore"):
-        worse = errors - errors[int(np.argmin(mean))]
-        allowed = np.std(worse, axis=1, ddof=1) / np.sqrt(errors.shape[1])
-        close = np.flatnonzero(np.mean(worse, axis=1) <= allowed)
-    return judged[min(close, key=lambda i: (judged[i].whitened, judged[i].order, mean[i]))]
+        worse = errors[:, np.newaxis] - errors[np.newaxis]
+        allowed = np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
+        unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
+    best = int(np.argmin(np.mean(errors, axis=1)))
+    every = {best, *np.flatnonzero(unbeaten).tolist()}
+    return judged[min(every, key=lambda i: (judged[i].whitened, judged[i].order))]

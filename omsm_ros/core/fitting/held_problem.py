@@ -72,7 +72,8 @@ class DiscreteScaled(Scaled):
         outside = np.abs(poles) > 1
         inside = np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
         inside = inside * (1 - _OFF_BORDER)
-        return self.nonlinear_of(_PER_BILINEAR * (inside - 1) / (inside + 1), 0.0)
+        bilinear = np.asarray(_PER_BILINEAR * (inside - 1) / (inside + 1), np.complex128)
+        return self.nonlinear_of(bilinear, 0.0)
 
 
 class HeldProblem(Problem):
@@ -134,3 +135,53 @@ class HeldProblem(Problem):
         free = np.column_stack([columns[:, terms:], self.background])
         state = least_squares(free[self.used], (self.output - moved)[self.used])
         return np.asarray(moved + free @ state)
+
+    def residual(self, fitted: Fit) -> FloatArray:
+        """Output less a free run, where it is used, (k,)."""
+        return np.asarray((self.output - self.free_run(fitted))[self.used])
+
+
+def coefficients(fitted: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return numerator (n+1,) and denominator (n+1,) in q, its first 1, and their derivatives.
+
+    The derivatives (2n + 1, 2n + 1) are of numerator, denominator[1:] by the terms of the
+    numerator, ψ, as :meth:`HeldProblem.columns` orders them.
+    """
+    scaled, order = fitted.scaled, fitted.structure.poles
+    assert isinstance(scaled, DiscreteScaled)
+    factors = scaled.polynomials(fitted.nonlinear)
+    whole = _product(factors)
+    terms = fitted.driven[: order + 1]
+    numerator, denominator = terms / whole[0], whole / whole[0]
+    jacobian = np.zeros((2 * order + 1, 2 * order + 1))
+    jacobian[: order + 1, : order + 1] = np.eye(order + 1) / whole[0]
+    for column, changed in enumerate(_changes(scaled, fitted.nonlinear, factors)):
+        jacobian[: order + 1, order + 1 + column] = -numerator * changed[0] / whole[0]
+        moved = (changed - denominator * changed[0]) / whole[0]
+        jacobian[order + 1 :, order + 1 + column] = moved[1:]
+    return numerator, denominator, jacobian
+
+
+def _product(factors: list[FloatArray]) -> FloatArray:
+    product: FloatArray = np.ones(1)
+    for factor in factors:
+        product = np.asarray(polynomial.polymul(product, factor), np.float64)
+    return product
+
+
+def _changes(
+    scaled: DiscreteScaled, nonlinear: FloatArray, factors: list[FloatArray]
+) -> list[FloatArray]:
+    """Derivatives of the product of ``factors`` by each of ψ, ascending in q."""
+    up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
+    first, second = [], []
+    for place, section in enumerate(scaled.sections(nonlinear)):
+        others = _product(factors[:place] + factors[place + 1 :])
+        if len(section) == 3:
+            linear = section[1] * polynomial.polymul(down, up)
+            square = section[2] * polynomial.polymul(down, down)
+            second.append(np.asarray(polynomial.polymul(square, others), np.float64))
+        else:
+            linear = section[1] * down
+        first.append(np.asarray(polynomial.polymul(linear, others), np.float64))
+    return first + second

@@ -83,7 +83,7 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     used = record.ok & ~_after_loss(record)
     used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
-    carried = _from_rest_to_rest(motion, steps.moving, record.sample_period)
+    carried = from_rest_to_rest(motion, steps.moving, record.sample_period)
     used &= carried == motion
     if np.sum(used) < LEAST_SAMPLES:
         raise StepTestError(
@@ -104,7 +104,7 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     )
 
 
-def _from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
+def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
     """``motion`` (n,), where it starts or ends moving faded to its mean there.
 
     A motion that breaks off would have content at all frequencies, where there was none.

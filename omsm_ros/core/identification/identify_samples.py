@@ -1,0 +1,178 @@
+"""Identify how one sampled quantity follows another, whatever they are and in what units.
+
+The engine is that of :mod:`omsm_ros.core.identification.identify`; what a probe on a machine must
+be like (its gain, its noise at rest, its steps) is not asked here. ``hold`` says what the
+input does between samples:
+
+| hold | the input | the model |
+|---|---|---|
+| band-limited | moves smoothly, as what is measured does | G(s) with a delay |
+| zero-order | stands still from sample to sample, as a command does | H(z), and the G(s) of it |
+| first-order | runs straight from sample to sample | the same H(z), another G(s) |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held_equivalent
+from omsm_ros.core.dynamics.response_band import Band, ResponseLimits, widening
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.covariance import parameter_covariance
+from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
+from omsm_ros.core.fitting.held_problem import coefficients
+from omsm_ros.core.fitting.least_squares import least_squares
+from omsm_ros.core.identification.band_limited_samples import band_limited
+from omsm_ros.core.identification.residual_tests import independence, whiteness
+from omsm_ros.core.identification.sampled_model import BAND_LIMITED, Discrete, SampledModel
+from omsm_ros.core.identification.sampled_verdict import (
+    SAMPLED_LIMITS,
+    longest_range,
+    sampled_certificate,
+)
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.errors import ConfigurationError
+
+HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
+_FREQUENCIES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """The model of one candidate, on a grid of frequencies."""
+
+    discrete: Discrete
+    frequency: FloatArray
+    band: Band
+
+    @classmethod
+    def of(cls, candidate: SampledCandidate, delay: int, period: float) -> _Known:
+        problem = candidate.problem
+        numerator, denominator, jacobian = coefficients(candidate.fit)
+        every = parameter_covariance(
+            problem, problem.columns(candidate.fit), problem.residual(candidate.fit)
+        )
+        size = len(jacobian)
+        covariance = jacobian @ every[:size, :size] @ jacobian.T
+        discrete = Discrete(
+            numerator=numerator,
+            denominator=denominator,
+            delay=delay,
+            covariance=np.asarray(0.5 * (covariance + covariance.T)),
+        )
+        frequency = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
+        return cls(discrete, frequency, discrete.band(frequency, period))
+
+
+def identify_samples(
+    input: FloatArray,
+    output: FloatArray,
+    period: float,
+    *,
+    hold: str = ZERO_ORDER,
+    order: int = 0,
+    max_delay: int = 3,
+    used: BoolArray | None = None,
+    limits: ResponseLimits = SAMPLED_LIMITS,
+) -> SampledModel:
+    """Return the model by which ``output`` (n,) follows ``input`` (n,), sampled evenly.
+
+    period: from sample to sample [s]
+    hold: what the input does between samples, one of HOLDS
+    order: number of poles, 0 to choose it
+    max_delay: of a held input, whole samples to try; of a band-limited one the delay is free
+    used: True where the output counts, None where it is finite
+    limits: of the 95 % band, deciding between which frequencies the model is valid
+
+    Raises IdentificationError for a useless record, ConfigurationError for another hold.
+    """
+    if hold not in HOLDS:
+        raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
+    used = np.isfinite(output) if used is None else used & np.isfinite(output)
+    if hold == BAND_LIMITED:
+        return band_limited(input, output, used, period, order, limits)
+    choice = choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
+    known = _Known.of(choice.chosen, choice.delay, period)
+    known, factor = _no_surer(known, choice, period, limits)
+    low, high = longest_range(known.band, limits)
+    return SampledModel(
+        hold=hold,
+        sample_period=period,
+        discrete=known.discrete,
+        continuous=_continuous(known.discrete, period, hold),
+        covariance=None,
+        valid_from=low,
+        valid_up_to=high,
+        working_point=(float(np.mean(input)), _resting(known.discrete, input, output, used)),
+        certificate=sampled_certificate(
+            order=choice.chosen.order,
+            free_order=choice.free.order,
+            widened=factor,
+            valid=(low, high),
+            limits=limits,
+            entries=_entries(choice, output[used]),
+        ),
+    )
+
+
+def _no_surer(
+    known: _Known, choice: SampledChoice, period: float, limits: ResponseLimits
+) -> tuple[_Known, float]:
+    """``known`` with uncertainties that hold those of the free choice, and their factor."""
+    if choice.chosen.order == choice.free.order:
+        return known, 1.0
+    free = _Known.of(choice.free, choice.delay, period)
+    ratio = free.discrete.response(known.frequency, period) / known.discrete.response(
+        known.frequency, period
+    )
+    low, high = longest_range(known.band, limits)
+    trusted = (known.frequency >= low) & (known.frequency <= high)
+    cut = [
+        Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted])
+        for b in (known.band, free.band)
+    ]
+    with np.errstate(divide="ignore"):
+        factor = widening(cut[0], cut[1], np.log(ratio[trusted]))
+    wider = replace(known.discrete, covariance=factor**2 * known.discrete.covariance)
+    return replace(known, discrete=wider, band=wider.band(known.frequency, period)), factor
+
+
+def _resting(discrete: Discrete, input: FloatArray, output: FloatArray, used: BoolArray) -> float:
+    """Output at which the model rests where the input has its mean, initial state fitted."""
+    order, samples = len(discrete.denominator) - 1, len(input)
+    late = np.roll(input, discrete.delay) - np.mean(input)
+    late[: discrete.delay] = 0.0
+    driven = signal.lfilter(discrete.numerator, discrete.denominator, late)
+    pulses = np.eye(max(order + discrete.delay, 1), samples)
+    decays = signal.lfilter([1.0], discrete.denominator, pulses, axis=1)
+    columns = np.column_stack([decays.T, np.ones(samples)])
+    return float(least_squares(columns[used], (output - driven)[used])[-1])
+
+
+def _continuous(discrete: Discrete, period: float, hold: str) -> TransferFunction | None:
+    found = held_equivalent(discrete.numerator, discrete.denominator, period, hold)
+    return None if found is None else replace(found, delay=discrete.delay * period)
+
+
+def _entries(choice: SampledChoice, output: FloatArray) -> dict[str, object]:
+    chosen, problem = choice.chosen, choice.chosen.problem
+    residual, variance = problem.residual(chosen.fit), float(np.var(output)) or 1.0
+    drive = np.gradient(problem.input)[problem.used]
+    return {
+        "delay_samples": choice.delay,
+        "whitened": chosen.whitened,
+        "residual_rms": float(np.sqrt(np.mean(residual**2))),
+        "explained": 1 - float(np.mean(residual**2)) / variance,
+        "predicted": 1 - float(np.mean(chosen.hidden)) / variance,
+        "last_part_by_order": [_finite(1 - float(e) / variance) for e in choice.by_order],
+        "whiteness_p": whiteness(residual),
+        "independence_p": independence(residual, drive),
+        "samples": {"received": len(problem.used), "compared": int(np.sum(problem.used))},
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

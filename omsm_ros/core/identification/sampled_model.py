@@ -1,0 +1,115 @@
+"""A model between samples of any two quantities: its coefficients, and how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from omsm_ros.core.dynamics.response_band import Band
+from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.samples.blocks import FloatArray
+
+SCHEMA = "omsm-model/1"
+BAND_LIMITED = "band-limited"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Discrete:
+    """``H = (b0 + b1 z⁻¹ + …)/(1 + a1 z⁻¹ + …) · z^-delay``.
+
+    numerator: (m+1,);  denominator: (n+1,), its first is 1;  delay: whole samples
+    covariance: (m + 1 + n,) squared, order numerator, denominator[1:]
+    """
+
+    numerator: FloatArray
+    denominator: FloatArray
+    delay: int
+    covariance: FloatArray
+
+    def response(self, frequency: FloatArray, period: float) -> ComplexArray:
+        """H at ``frequency`` (k,) [Hz], for samples every ``period`` [s]."""
+        q = np.exp(-2j * np.pi * np.asarray(frequency) * period)
+        up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
+        return np.asarray(up / down * q**self.delay, np.complex128)
+
+    def band(self, frequency: FloatArray, period: float) -> Band:
+        """Standard uncertainty of gain, relative, and phase [rad] at ``frequency`` (k,) [Hz]."""
+        q = np.exp(-2j * np.pi * np.asarray(frequency) * period)[:, np.newaxis]
+        up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
+        jacobian = np.concatenate(
+            [
+                q ** np.arange(len(self.numerator)) / up,
+                -(q ** np.arange(1, len(self.denominator))) / down,
+            ],
+            axis=1,
+        )
+        variance = [
+            np.einsum("kp,pq,kq->k", part, self.covariance, part)
+            for part in (jacobian.real, jacobian.imag)
+        ]
+        gain, phase = np.sqrt(np.maximum(variance, 0.0))
+        return Band(np.asarray(frequency, np.float64), gain, phase)
+
+    @property
+    def _both(self) -> tuple[FloatArray, FloatArray]:
+        return self.numerator, self.denominator
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SampledModel:
+    """How samples of ``output`` follow from samples of ``input``, in the units of the record.
+
+    hold: what the input does between samples: "band-limited", "zero-order" or "first-order"
+    working_point: input, and the output that rests there; the model is of deviations from both
+    discrete: the model of a held input, None of a band-limited one
+    continuous: G(s) with its gain; of a held input the one that makes ``discrete``, None if none
+    covariance: (p, p) of ``continuous``, order numerator, denominator[1:], delay; None of a held
+        input, whose covariance is in ``discrete``
+    valid_from, valid_up_to: [Hz] between which the 95 % band keeps within the limits; equal
+        where it does so nowhere
+    certificate: JSON values
+    """
+
+    hold: str
+    sample_period: float
+    discrete: Discrete | None
+    continuous: TransferFunction | None
+    covariance: FloatArray | None
+    valid_from: float
+    valid_up_to: float
+    working_point: tuple[float, float]
+    certificate: Mapping[str, object] = field(default_factory=dict)
+
+    def content(self) -> dict[str, object]:
+        """The model as JSON values."""
+        return {
+            "schema": SCHEMA,
+            "hold": self.hold,
+            "sample_period": self.sample_period,
+            "discrete": None if self.discrete is None else _discrete_content(self.discrete),
+            "continuous": None if self.continuous is None else self._continuous_content(),
+            "working_point": list(self.working_point),
+            "valid_from": self.valid_from,
+            "valid_up_to": self.valid_up_to,
+            "certificate": dict(self.certificate),
+        }
+
+    def _continuous_content(self) -> dict[str, object]:
+        assert self.continuous is not None
+        return {
+            "numerator": self.continuous.numerator.tolist(),
+            "denominator": self.continuous.denominator.tolist(),
+            "delay": self.continuous.delay,
+            "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
+        }
+
+
+def _discrete_content(discrete: Discrete) -> dict[str, object]:
+    return {
+        "numerator": discrete.numerator.tolist(),
+        "denominator": discrete.denominator.tolist(),
+        "delay_samples": discrete.delay,
+        "covariance": discrete.covariance.ravel().tolist(),
+    }

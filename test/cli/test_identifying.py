@@ -1,0 +1,138 @@
+"""``omsm identify`` of tables, and of bags behind a hold."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from omsm_ros import cli
+from omsm_ros.storage import bags
+from omsm_ros.twin.cell import blocks_of
+
+B, A = np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5])
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([0.0, 2.0], 150), 4)
+    y = signal.lfilter(B, A, u) + rng.normal(0, 0.01, 600)
+    path = tmp_path_factory.mktemp("tables") / "record.csv"
+    np.savetxt(path, np.column_stack([u, y]), delimiter=",", header="valve,flow", comments="")
+    return path
+
+
+def run(capsys, *arguments):
+    status = cli.main([str(a) for a in ("identify", *arguments)])
+    return status, capsys.readouterr()
+
+
+COLUMNS = ("--input", "valve", "--output", "flow", "--period", 0.1)
+
+
+def test_a_table_gives_a_model_that_runs_freely(capsys, table, tmp_path):
+    out = tmp_path / "model.json"
+    status, said = run(capsys, table, *COLUMNS, "--hold", "zero-order", "--out", out, "--json")
+    assert status == 0
+    facts = json.loads(said.out)
+    assert facts["verdict"].startswith("accepted from")
+    assert facts["predicted"] > 0.98
+    model = json.loads(out.read_text())
+    assert model["schema"] == "omsm-model/1"
+    discrete = model["discrete"]
+    u, y = np.loadtxt(table, delimiter=",", skiprows=1).T
+    late = np.concatenate([np.zeros(discrete["delay_samples"]), u])[:600]
+    free = signal.lfilter(discrete["numerator"], discrete["denominator"], late)
+    assert np.std((free - y)[100:] - np.mean((free - y)[100:])) < 0.015
+    size = len(discrete["numerator"]) + len(discrete["denominator"]) - 1
+    assert len(discrete["covariance"]) == size**2
+
+
+def test_an_order_and_people(capsys, table, tmp_path):
+    arguments = (
+        table,
+        *COLUMNS,
+        "--hold",
+        "zero-order",
+        "--order",
+        2,
+        "--out",
+        tmp_path / "m.json",
+    )
+    status, said = run(capsys, *arguments)
+    assert status == 0
+    for text in ("verdict", "free runs", "valid", "m.json"):
+        assert text in said.out
+
+
+def test_the_default_hold_of_a_table_is_band_limited(capsys, table, tmp_path):
+    out = tmp_path / "model.json"
+    run(capsys, table, *COLUMNS, "--out", out, "--json")
+    (path,) = tmp_path.iterdir()
+    model = json.loads(path.read_text())
+    assert model["hold"] == "band-limited"
+    assert model["discrete"] is None
+    assert model["continuous"]["covariance"]
+
+
+def test_duration_cuts_the_table(capsys, table, tmp_path):
+    arguments = ("--hold", "zero-order", "--duration", 30, "--out", tmp_path / "m.json", "--json")
+    _, said = run(capsys, table, *COLUMNS, *arguments)
+    assert json.loads(said.out)["samples"]["received"] == 300
+
+
+def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test, tmp_path):
+    bag = tmp_path / "steps.mcap"
+    with bags.BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+        for axes, distance in blocks_of(step_test):
+            writer.write_axes(axes)
+            writer.write_distance(distance)
+    arguments = ("--hold", "zero-order", "--duration", 3, "--order", 2, "--max-delay", 0)
+    run(capsys, bag, *arguments, "--out", tmp_path / "model.json", "--json")
+    (path,) = tmp_path.glob("model*.json")
+    model = json.loads(path.read_text())
+    # The probe counts down when Z rises.
+    gain = sum(model["discrete"]["numerator"]) / sum(model["discrete"]["denominator"])
+    assert gain == pytest.approx(-1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--input", "valve", "--output", "flow"), "--period"),
+        (("--input", "valve", "--period", 0.1), "--output"),
+        (("--input", "valve", "--output", "leak", "--period", 0.1), "'leak'"),
+        ((*COLUMNS, "--report", "out"), "--report"),
+        ((*COLUMNS, "--hold", "third-order"), "hold"),
+        ((*COLUMNS, "--period", 0), "sample period"),
+    ],
+)
+def test_wrong_arguments_are_one_line_and_status_2(capsys, table, tmp_path, arguments, says):
+    try:
+        status, said = run(capsys, table, *arguments, "--out", tmp_path / "m.json")
+    except SystemExit as exit:
+        status, said = exit.code, capsys.readouterr()
+    assert status == 2
+    assert says in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_a_bag_needs_no_period(capsys, tmp_path):
+    status, said = run(capsys, "steps.mcap", "--period", 0.001, "--out", tmp_path / "m.json")
+    assert status == 2
+    assert "for a table" in said.err
+
+
+def test_a_rejected_model_replaces_none(capsys, tmp_path):
+    rng = np.random.default_rng(3)
+    path, out = tmp_path / "walk.csv", tmp_path / "model.json"
+    walk = np.column_stack([rng.normal(size=400), np.cumsum(rng.normal(size=400))])
+    np.savetxt(path, walk, delimiter=",", header="u,y", comments="")
+    out.write_text("a good one")
+    arguments = ("--input", "u", "--output", "y", "--period", 1, "--hold", "zero-order")
+    status, said = run(capsys, path, *arguments, "--out", out)
+    assert status == 2
+    assert "rejected" in said.err
+    assert out.read_text() == "a good one"
+    assert (tmp_path / "model.rejected.json").exists()
