@@ -35,6 +35,7 @@ ROOMS = {
     "fitting": FITTING,
     "departures": FITTING | {"fitting"},
     "identification": FITTING | {"fitting", "departures"},
+    "sampled": FITTING | {"fitting", "departures", "identification"},
     "correction": FITTING,
     "surface": FITTING | {"correction"},
     "verification": FITTING | {"fitting", "departures", "identification", "correction", "surface"},
@@ -278,7 +279,7 @@ def test_a_broken_rule_is_told(rule, name, source, told):
 def test_a_room_that_looks_where_it_must_not_is_told(room, other):
     """The whole graph: the corridor from samples to identification, and who stands beside it."""
     order = ["samples", "dynamics", "machine", "fitting", "departures", "identification"]
-    beside = {"correction": 3, "surface": 3, "verification": 6}
+    beside = {"sampled": 6, "correction": 3, "surface": 3, "verification": 6}
     allowed = set(order[: order.index(room) if room in order else beside[room]]) | {room}
     allowed |= {"surface": {"correction"}, "verification": {"correction", "surface"}}.get(
         room, set()

@@ -10,8 +10,8 @@ from omsm_ros.cli.arguments import json_object, number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.identification.identify_samples import HOLDS
-from omsm_ros.core.identification.sampled_model import BAND_LIMITED, SampledModel
+from omsm_ros.core.sampled.identify_samples import HOLDS
+from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.identify_table import model_of_motion, model_of_table

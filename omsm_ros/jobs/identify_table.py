@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omsm_ros.core.identification.identify_samples import identify_samples
-from omsm_ros.core.identification.sampled_model import SampledModel
+from omsm_ros.core.sampled.identify_samples import identify_samples
+from omsm_ros.core.sampled.model import SampledModel
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.storage.table_file import load_columns
 

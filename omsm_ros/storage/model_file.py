@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omsm_ros.core.identification.sampled_model import SampledModel
+from omsm_ros.core.sampled.model import SampledModel
 from omsm_ros.storage.files import save_json
 
 

@@ -12,9 +12,9 @@ from omsm_ros.core.fitting.free_run_choice import SampledCandidate
 from omsm_ros.core.fitting.held_problem import HeldProblem
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import fit
-from omsm_ros.core.identification.identify_samples import HOLDS, _Known, identify_samples
-from omsm_ros.core.identification.sampled_model import Discrete
-from omsm_ros.core.identification.sampled_verdict import longest_range, sampled_certificate
+from omsm_ros.core.sampled.identify_samples import HOLDS, _Known, identify_samples
+from omsm_ros.core.sampled.model import Discrete
+from omsm_ros.core.sampled.verdict import longest_range, sampled_certificate
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD = 0.05

@@ -15,8 +15,8 @@ from omsm_ros.core.fitting.steps import LEAST_SAMPLES, Steps, held_out, sample_n
 from omsm_ros.core.identification.model_choice import choose_model, model_from_start
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
-from omsm_ros.core.identification.sampled_model import BAND_LIMITED, SampledModel
-from omsm_ros.core.identification.sampled_verdict import longest_range, sampled_certificate
+from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
+from omsm_ros.core.sampled.verdict import longest_range, sampled_certificate
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 
@@ -36,7 +36,7 @@ def band_limited(
 ) -> SampledModel:
     """Return the model of a record whose input moves smoothly between samples.
 
-    Arguments as of :func:`~omsm_ros.core.identification.identify_samples.identify_samples`.
+    Arguments as of :func:`~omsm_ros.core.sampled.identify_samples.identify_samples`.
     """
     prepared, model = model_from_start(_prepared(input, output, used), order)
     known = response_uncertainty(prepared, model, limits)
@@ -104,7 +104,7 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
         rate=2 * np.pi * content_frequency(input, _NOMINAL_PERIOD_S),
     )
     steps = Steps((), moving, sample_noise(input), float(np.ptp(input)))
-    return Prepared(problem, steps, 0, None)
+    return Prepared(problem, steps, 0)
 
 
 def _slower(

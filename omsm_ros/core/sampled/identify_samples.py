@@ -25,10 +25,10 @@ from omsm_ros.core.fitting.covariance import parameter_covariance
 from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.fitting.least_squares import least_squares
-from omsm_ros.core.identification.band_limited_samples import band_limited
 from omsm_ros.core.identification.residual_tests import independence, whiteness
-from omsm_ros.core.identification.sampled_model import BAND_LIMITED, Discrete, SampledModel
-from omsm_ros.core.identification.sampled_verdict import (
+from omsm_ros.core.sampled.band_limited import band_limited
+from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
+from omsm_ros.core.sampled.verdict import (
     SAMPLED_LIMITS,
     longest_range,
     sampled_certificate,
