@@ -65,7 +65,8 @@ def _made(kind: Any, content: Any) -> Any:
     kind = _without_none(kind)
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
-        return kind(**{name: _made(hints[name], value) for name, value in content.items()})
+        make: Any = kind
+        return make(**{name: _made(hints[name], value) for name, value in content.items()})
     if typing.get_origin(kind) is tuple:
         return tuple(_made(typing.get_args(kind)[0], item) for item in content)
     return kind(content)

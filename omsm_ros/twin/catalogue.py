@@ -76,14 +76,18 @@ def _drift(name: str, *sizes: float, **fixed: float) -> Sizes:
 
 
 def _spindle(name: str, *sizes: float, per_turn: int) -> Sizes:
+    error: Callable[..., SpindleError] = SpindleError
     return _machine(
-        "spindle",
-        *(SpindleError(**{name: (Harmonic(amplitude=s, per_turn=per_turn),)}) for s in sizes),
+        "spindle", *(error(**{name: (Harmonic(amplitude=s, per_turn=per_turn),)}) for s in sizes)
     )
 
 
 CATALOGUE: dict[str, Sizes] = {
-    "slow servo": tuple(Disturbances(servo_bandwidth_hz=f) for f in (100.0, 70.0, 50.0)),
+    "slow servo": (
+        Disturbances(servo_bandwidth_hz=100.0),
+        Disturbances(servo_bandwidth_hz=70.0),
+        Disturbances(servo_bandwidth_hz=50.0),
+    ),
     "latency": _probe("latency_s", 0.05e-3, 0.17e-3, 0.34e-3),
     "exposure": _probe("exposure_s", 0.1e-3, 0.3e-3, 0.9e-3),
     "averaging": _probe("averages", 2, 4, 8, exposure_s=0.2e-3),

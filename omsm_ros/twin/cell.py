@@ -118,7 +118,7 @@ def record(
     steps = substeps or _enough_substeps(cell.sample_period)
     timing = Timing(round(motion.duration / cell.sample_period), cell.sample_period, steps)
     scene = scene_of(cell.plant, errors, motion, surface, stand_off, timing, random)
-    nominal = np.arange(timing.samples) * cell.sample_period
+    nominal = np.arange(timing.samples, dtype=np.float64) * cell.sample_period
     instants = errors.clocks.instants(nominal, random["clocks"])
     seen = scene.over_an_exposure(instants.probe)
     return Recording(
@@ -192,14 +192,14 @@ def _further_channels(
 ) -> dict[str, Any]:
     """Reference and acceleration, as far as there are such sensors."""
     channels: dict[str, Any] = {}
-    if sensor := scene.disturbances.reference:
-        channels["reference"] = sensor.read(
+    if reference := scene.disturbances.reference:
+        channels["reference"] = reference.read(
             scene.carriage, when.trigger, timing.period, random["reference"]
         )
-    if sensor := scene.disturbances.accelerometer:
-        period = sensor.sample_period_s or timing.period
-        time = np.arange(round(timing.duration / period)) * period
-        channels["acceleration"] = sensor.read(
+    if accelerometer := scene.disturbances.accelerometer:
+        period = accelerometer.sample_period_s or timing.period
+        time = np.arange(round(timing.duration / period), dtype=np.float64) * period
+        channels["acceleration"] = accelerometer.read(
             scene.acceleration(time, period), period, random["accelerometer"]
         )
     return channels

@@ -35,7 +35,8 @@ class Driven(Trajectory):
         driver = self.driver.at(time)
         following = np.ceil((time - self.start) / self.step).astype(np.int64)
         held = self.held[np.minimum(following, len(self.held) - 1)]
-        return np.clip(held, driver - self.half_width, driver + self.half_width)
+        low, high = driver - self.half_width, driver + self.half_width
+        return np.asarray(np.clip(held, low, high), np.float64)
 
 
 def backlash(driver: Trajectory, width: float) -> Driven:

@@ -137,14 +137,14 @@ def _seen_through(system: TransferFunction, delay: float, motion: Motion, grid: 
 
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
     """Z commanded in the middle of each of ``count`` steps [s] after ``begin`` [s]."""
-    return motion.positions(begin + (np.arange(count) + 0.5) * step).z
+    return motion.positions(begin + (np.arange(count, dtype=np.float64) + 0.5) * step).z
 
 
 def _series(first: TransferFunction, second: TransferFunction) -> TransferFunction:
     multiply = np.polynomial.polynomial.polymul
     return TransferFunction(
-        multiply(first.numerator, second.numerator),
-        multiply(first.denominator, second.denominator),
+        np.asarray(multiply(first.numerator, second.numerator), np.float64),
+        np.asarray(multiply(first.denominator, second.denominator), np.float64),
     )
 
 

@@ -53,7 +53,9 @@ def on_a_flat(
 
     The flat is no part: it has no pose.
     """
-    z = motion.positions(np.arange(0.0, motion.duration, scenario.sample_period)).z
+    z = motion.positions(
+        np.arange(0.0, motion.duration, scenario.sample_period, dtype=np.float64)
+    ).z
     fixed = replace(disturbances, machine=replace(disturbances.machine, pose=PartPose()))
     cell = Cell(seed=scenario.seed, sample_period=scenario.sample_period, disturbances=fixed)
     return record(cell, motion, Flat(), stand_off=-float(z.max() + z.min()) / 2)

@@ -168,7 +168,7 @@ def scene_of(
     if disturbances.servo_bandwidth_hz is not None:
         plant = replace(plant, servo_bandwidth=disturbances.servo_bandwidth_hz)
     grid = _grid(plant, disturbances, timing)
-    times = np.arange(-grid.lead, grid.samples + 1) * timing.period
+    times = np.arange(-grid.lead, grid.samples + 1, dtype=np.float64) * timing.period
     moved = move(plant, motion, grid)
     if not is_default(disturbances.structure):
         slide_x = Trajectory(times[0], timing.period, motion.positions(times).x)

@@ -213,7 +213,7 @@ def _spun_up(probe: Trajectory) -> FloatArray:
     mean = probe.values[:before].mean()
     moving = probe.values - mean
     moving[:before] *= s_curve(np.arange(before) / before)
-    return moving
+    return np.asarray(moving, np.float64)
 
 
 def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: float) -> FloatArray:

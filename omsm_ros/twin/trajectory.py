@@ -24,7 +24,7 @@ class Trajectory:
     @property
     def times(self) -> FloatArray:
         """Instants of the values [s], (n,)."""
-        return self.start + np.arange(len(self.values)) * self.step
+        return self.start + np.arange(len(self.values), dtype=np.float64) * self.step
 
     def at(self, time: FloatArray) -> FloatArray:
         """Value at ``time`` [s], of its shape: itself on the grid, a cubic through four beside it.
