@@ -192,7 +192,7 @@ def _value_of(flag: str) -> st.SearchStrategy[str]:
     if flag in _FILES:
         return PATHS
     if flag in ("--settings", "--sources"):
-        named = st.sampled_from(["probe_noise", "abbe", "machine", "static_gain"])
+        named = st.sampled_from(["probe_noise", "pitch", "machine", "static_gain"])
         objects = st.dictionaries(st.one_of(named, TEXTS), VALUES, max_size=3).map(json.dumps)
         return st.one_of(objects, VALUES.map(json.dumps), TEXTS, st.just("[" * 5000))
     return st.one_of(NUMBERS.map(str), NUMBERS.map(repr), TEXTS)

@@ -24,15 +24,12 @@ def objections(
     sample_period: float | None = None,
     settings: Mapping[str, object] | None = None,
     polarity: int | None = None,
-    age: float | None = None,
-    max_age: float | None = None,
 ) -> tuple[str, ...]:
     """Why ``calibration`` should not be used; empty if nothing speaks against it.
 
     sample_period: of the data [s];  polarity: that the correction will use
     settings: as they are now; a name that both sides know must have the same value, one that
         the calibration was made with must not be missing
-    age, max_age: since it was made, and when it is stale [s]
     """
     found = [*_certificate(calibration, polarity)]
     expected = calibration.sample_period
@@ -40,8 +37,6 @@ def objections(
         found.append(f"sample period is {sample_period!r} s, calibrated at {expected!r} s")
     if settings is not None:
         found += _differences(calibration.settings, settings)
-    if age is not None and max_age is not None and age > max_age:
-        found.append(f"it was made {age:.0f} s ago, more than the {max_age:.0f} s allowed")
     return tuple(found)
 
 

@@ -17,7 +17,6 @@ from omsm_ros.core.correction.motion_filter import ABSURD, MotionFilter, MotionF
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
@@ -42,7 +41,6 @@ class CorrectionOptions:
     lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
         None takes the calibration's lag if its settings say ``lag_is_latency``
     geometry: where the probe sits and looks
-    interpolation: order of the polynomial between samples, 1 to 7
     """
 
     polarity: int = 1
@@ -52,7 +50,6 @@ class CorrectionOptions:
     sources: ErrorSources | None = None
     lateral_lag: float | None = None
     geometry: Geometry = field(default_factory=Geometry)
-    interpolation: int = DEFAULT_ORDER
 
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
@@ -188,7 +185,6 @@ class Corrector:
             period,
             lateral_lag(self._calibration, self._options),
             self._sources.lateral_lag,
-            self._options.interpolation,
         )
         self._noise_gain = filters.height.noise_gain
         return MotionFilter(filters)
@@ -231,7 +227,13 @@ class Corrector:
         self, reading: FloatArray, dynamics: FloatArray, timing: FloatArray
     ) -> FloatArray:
         variances = contributions(
-            self._sources, self._noise_gain, self._static_gain, reading, dynamics, timing
+            self._sources,
+            self._noise_gain,
+            self._static_gain,
+            reading,
+            dynamics,
+            timing,
+            self._options.geometry.abbe_arm,
         )
         for name, variance in variances.items():
             common = isinstance(variance, float)

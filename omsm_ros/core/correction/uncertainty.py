@@ -21,7 +21,12 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunct
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
-from omsm_ros.quantities import GAIN_UNCERTAINTY, TIME_UNCERTAINTY, UNCERTAINTY
+from omsm_ros.quantities import (
+    ANGLE_UNCERTAINTY,
+    GAIN_UNCERTAINTY,
+    TIME_UNCERTAINTY,
+    UNCERTAINTY,
+)
 from omsm_ros.units import MICROMETRE_M
 
 # A direction of the covariance that adds less than this share of the variance is left out.
@@ -31,7 +36,11 @@ _ORDER = 5
 
 
 # All others are lengths.
-_QUANTITIES = {"static_gain": GAIN_UNCERTAINTY, "lateral_lag": TIME_UNCERTAINTY}
+_QUANTITIES = {
+    "static_gain": GAIN_UNCERTAINTY,
+    "lateral_lag": TIME_UNCERTAINTY,
+    "pitch": ANGLE_UNCERTAINTY,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +53,7 @@ class ErrorSources:
     lateral_lag: of the sideways lag [s]; it shifts the points along the path
     motion_error: of what follows the motion but not linearly, backlash and the like [m]
     discretisation: of H against G on this motion [m]
-    abbe: of z by pitch of the slide over its Abbe arm [m]
+    pitch: of the Z slide's pitch [rad], which moves the beam by itself times the Abbe arm
     """
 
     probe_noise: float = 0.0
@@ -55,7 +64,7 @@ class ErrorSources:
     lateral_lag: float = 0.0
     motion_error: float = 0.0
     discretisation: float = 0.0
-    abbe: float = 0.0
+    pitch: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -98,11 +107,13 @@ def contributions(
     distance: FloatArray,
     dynamics: FloatArray,
     timing: FloatArray,
+    abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
     """Variances of the heights [m²] by their source, each (n,) or the same for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
     dynamics, timing: variance of H(z) from the covariance and from the sideways lag, (n,)
+    abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
     return {
@@ -115,7 +126,7 @@ def contributions(
         "encoder_resolution": (noise_gain * sources.encoder_resolution) ** 2 / 12,
         "motion_error": sources.motion_error**2,
         "discretisation": sources.discretisation**2,
-        "abbe": sources.abbe**2,
+        "abbe": (abbe_arm * sources.pitch) ** 2,
     }
 
 

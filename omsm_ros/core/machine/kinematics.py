@@ -23,7 +23,8 @@ class Geometry:
     centre_x, centre_y: slide positions at which the probe looks at the spindle axis [m]
     probe_x, probe_z: from the pivot of B to the point of zero distance, at b = 0 [m]
     beam_x, beam_y: slope of the beam against Z at b = 0 [1]
-    abbe_arm: from the Z encoder's line to the beam [m]; with a measured pitch it lowers z
+    abbe_arm: from the Z encoder's line to the beam [m]; what an unknown pitch of the slide
+        costs over it is a term of the uncertainty
     """
 
     centre_x: float = 0.0
@@ -63,19 +64,15 @@ def workpiece_points(
     b: FloatArray,
     c: FloatArray,
     distance: FloatArray,
-    pitch: FloatArray | None = None,
 ) -> WorkpiecePoints:
     """Surface points seen by the probe.
 
     slides: x, y and the probe's own z (H(z)) [m], each (n,);  b, c: [rad], (n,)
     distance: true distance along the beam, growing with the height of the surface [m], (n,)
-    pitch: measured pitch of the Z slide [rad], (n,); positive lowers the beam by arm · pitch
     """
     x, y, z = slides
     along_x, along_y, along_z = _reach(geometry, b, distance)
     height = z + along_z
-    if pitch is not None:
-        height = height - geometry.abbe_arm * pitch
     return WorkpiecePoints(
         *workpiece_xy(x - geometry.centre_x + along_x, y - geometry.centre_y + along_y, c), height
     )

@@ -242,6 +242,25 @@ def test_a_lost_first_sample_moves_the_time_on(scan: Recording) -> None:
     assert points.stamp_ns == 500_000_000
 
 
+def test_a_pitch_costs_height_over_the_abbe_arm(scan: Recording) -> None:
+    def stated(**changes: float) -> float:
+        sources = ErrorSources(
+            probe_noise=10e-9, **{k: v for k, v in changes.items() if k == "pitch"}
+        )
+        options = CorrectionOptions(
+            sources=sources, geometry=Geometry(abbe_arm=changes.get("abbe_arm", 0.0))
+        )
+        corrector = Corrector(calibration(covariance=np.zeros((7, 7))), options)
+        corrector.push_axes(scan.axes)
+        corrector.push_distance(scan.distance)
+        points = join_points([corrector.finish()])
+        return float(np.median(points.uncertainty))
+
+    plain = stated()
+    assert stated(pitch=2e-6) == plain
+    assert stated(pitch=2e-6, abbe_arm=0.05) == pytest.approx(np.hypot(plain, 100e-9), rel=1e-6)
+
+
 # --- every sample is accounted for ----------------------------------------------------------
 
 
@@ -527,11 +546,6 @@ def test_senseless_options_are_named(wrong: dict[str, float]) -> None:
     (name,) = wrong
     with pytest.raises(ConfigurationError, match=name):
         CorrectionOptions(**wrong)  # type: ignore[arg-type]
-
-
-def test_interpolation_out_of_range_is_named(scan: Recording) -> None:
-    with pytest.raises(ConfigurationError, match="order 9"):
-        Corrector(CALIBRATION, CorrectionOptions(interpolation=9)).push_axes(scan.axes)
 
 
 def test_a_certificate_with_a_senseless_noise_is_refused() -> None:

@@ -178,10 +178,16 @@ def test_contributions_by_hand() -> None:
         encoder_resolution=np.sqrt(12.0),
         static_gain=0.1,
         discretisation=5.0,
-        abbe=6.0,
+        pitch=2e-6,
     )
     found = contributions(
-        sources, 2.0, 0.5, np.array([0.0, 4.0]), np.array([7.0, 8.0]), np.array([9.0, 10.0])
+        sources,
+        2.0,
+        0.5,
+        np.array([0.0, 4.0]),
+        np.array([7.0, 8.0]),
+        np.array([9.0, 10.0]),
+        abbe_arm=0.1,
     )
     assert found["probe_noise"] == pytest.approx(16.0)
     assert found["probe_resolution"] == pytest.approx(4.0)
@@ -189,7 +195,8 @@ def test_contributions_by_hand() -> None:
     assert found["encoder_resolution"] == pytest.approx(4.0)
     assert found["static_gain"] == pytest.approx([0.0, 1.6**2])
     assert found["discretisation"] == 25.0
-    assert found["abbe"] == 36.0
+    # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
+    assert found["abbe"] == pytest.approx((200e-9) ** 2)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
     assert found["lateral_lag"] == pytest.approx([9.0, 10.0])
 
@@ -232,12 +239,12 @@ def test_a_senseless_uncertainty_is_named(name: str, value: float) -> None:
 class TestStatedSources:
     def test_take_the_place_of_what_the_certificate_says(self, true_calibration):
         calibration = replace(true_calibration, certificate={"noise_m": 1e-8})
-        sources = sources_with(calibration, {"encoder_noise": 4e-10, "abbe": 1e-9})
-        assert (sources.probe_noise, sources.encoder_noise, sources.abbe) == (1e-8, 4e-10, 1e-9)
+        sources = sources_with(calibration, {"encoder_noise": 4e-10, "pitch": 1e-6})
+        assert (sources.probe_noise, sources.encoder_noise, sources.pitch) == (1e-8, 4e-10, 1e-6)
 
     @pytest.mark.parametrize(
         ("stated", "named"),
-        [({"humidity": 1.0}, "humidity"), ({"abbe": "1 nm"}, "1 nm"), ({"abbe": -1.0}, "abbe")],
+        [({"humidity": 1.0}, "humidity"), ({"pitch": "1 nm"}, "1 nm"), ({"pitch": -1.0}, "pitch")],
     )
     def test_nonsense_is_refused_by_name(self, true_calibration, stated, named):
         with pytest.raises(ConfigurationError, match=named):

@@ -90,19 +90,6 @@ def test_a_tilted_beam_reads_the_cosine() -> None:
     assert found.x[0] == pytest.approx(50e-6 * np.sin(np.arctan(0.01)), rel=1e-12)
 
 
-def test_pitch_lowers_the_probe_over_its_abbe_arm() -> None:
-    one = np.ones(1)
-    found = workpiece_points(
-        Geometry(abbe_arm=0.1),
-        (0 * one, 0 * one, 1e-3 * one),
-        0 * one,
-        0 * one,
-        0 * one,
-        2e-6 * one,
-    )
-    assert found.height[0] == pytest.approx(1e-3 - 0.2e-6)
-
-
 def test_a_point_without_tilt_among_tilted_ones_is_the_same_to_the_last_bit() -> None:
     rng = np.random.default_rng(3)
     x, y, z, c, d = rng.normal(size=(5, 40)) * 1e-3
