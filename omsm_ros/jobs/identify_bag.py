@@ -6,20 +6,30 @@ from pathlib import Path
 
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
-from omsm_ros.errors import BagError
+from omsm_ros.core.samples.stamped_period import check_period
+from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
+from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.storage import bags
 
 # ------------------------------------------------------------------------ identification
 
 
 def motion_of_bag(
-    path: Path, *, duration: float = 0.0, progress: Progress = no_progress
+    path: Path,
+    *,
+    duration: float = 0.0,
+    time_lapse: object = 1.0,
+    progress: Progress = no_progress,
 ) -> MotionRecord:
     """The motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
 
+    time_lapse: how much faster than real time the recording was played [1]
     The reference sensor is used where it was recorded.
+
+    Raises DataError where the stamps contradict the sample period.
     """
+    faster = TIME_LAPSE.checked(time_lapse, ConfigurationError, "time_lapse")
     topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
     with bags.BagReader(path) as bag:
         if any(t.topic == bags.REFERENCE_TOPIC and t.messages for t in bag.topics()):
@@ -28,6 +38,8 @@ def motion_of_bag(
     if not blocks[bags.AXES_TOPIC] or not blocks[bags.DISTANCE_TOPIC]:
         raise BagError(f"{str(path)!r} has its topics but no samples on them; record a step test")
     axes, distance, *reference = (_beginning(blocks[topic], duration) for topic in topics)
+    for name, stream in (("axis", axes), ("distance", distance)):
+        check_period(name, stream, faster)
     return assemble(axes, distance, *reference)  # type: ignore[arg-type]
 
 

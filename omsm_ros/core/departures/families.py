@@ -30,7 +30,7 @@ _CREEPS_A_DECADE = 5
 _DAMPINGS = (0.03, 0.15)
 _FASTEST_MODE_HZ = 100.0
 # Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
-_SLIDING_TRAVELS_M = (0.05e-6, 0.3e-6, 1e-6, 3e-6, 10e-6)
+_SLIDING_TRAVELS_M = (0.05e-6, 0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
 # What gives way over less is a gap, not a drag.
 _BACKLASH_TRAVEL_M = 0.3e-6
 _MOST_CYCLES = 100

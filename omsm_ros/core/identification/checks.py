@@ -97,14 +97,17 @@ def requested_order(order: int, factor: float) -> Finding:
     )
 
 
-def poles_beyond(dynamics: TransferFunction, valid_up_to: float) -> Finding:
-    """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known."""
+def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float) -> Finding:
+    """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known.
+
+    One that is ten times faster than half the sampling rate shapes nothing, and is not named.
+    """
     return Finding(
         warnings=tuple(
             f"pole at {mode.frequency:.0f} Hz lies beyond {valid_up_to:.0f} Hz, "
             "up to which the response is known within limits: it need not be a resonance"
             for mode in dynamics.modes()
-            if mode.frequency > valid_up_to
+            if valid_up_to < mode.frequency < 10 * nyquist
         )
     )
 
@@ -117,5 +120,5 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: trusted_range(e.known.valid_up_to, e.limits),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),
-    lambda e: poles_beyond(e.dynamics, e.known.valid_up_to),
+    lambda e: poles_beyond(e.dynamics, e.known.valid_up_to, 0.5 / e.prepared.problem.period),
 )

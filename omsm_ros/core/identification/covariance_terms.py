@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from omsm_ros.core.departures.reference_lag import ReferenceLag, reference_lag
 from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.fitting.covariance import hidden_motion_covariance
 from omsm_ros.core.fitting.output_error import Fit
@@ -17,9 +20,14 @@ from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.inter_sample_bias import inter_sample_delay_bound
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.motion_record import MotionRecord
 
-# 3 mdeg at 15 Hz, below anything a scan would notice.
-_HARMLESS_DELAY_S = 0.5e-6
+# Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms). The band holds all of it.
+_HARMLESS_DELAY_S = 7e-6
+# A nanometre and a half on the paper's scan, whose Z moves at 0.7 mm/s (rms).
+_GREATEST_REFERENCE_LAG_S = 2e-6
+# Standard uncertainties beyond which a lag is no chance.
+_CLEARLY = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +61,36 @@ def hidden_motion_finding(bound: float, delay_noise: float) -> Finding:
             "too sharp for the sampling; use jerk-limited or dithered edges, or sample faster",
         )
     return Finding({"inter_sample_delay_bound_s": bound}, reasons=reasons)
+
+
+def reference_delay(record: MotionRecord, fit: Fit) -> CovarianceTerm:
+    """Return the term of the lag of the reference sensor, where it was the input.
+
+    A correction filters the encoder, so what the reference is late would be missing in it.
+    """
+    size = len(fit.dynamics.numerator) + len(fit.dynamics.denominator)
+    covariance, lag = np.zeros((size, size)), reference_lag(record)
+    if lag is None:
+        return CovarianceTerm(covariance)
+    covariance[-1, -1] = lag.value**2 + lag.uncertainty**2
+    return CovarianceTerm(covariance, reference_finding(lag))
+
+
+def reference_finding(lag: ReferenceLag) -> Finding:
+    """Reject a reference that is clearly late, or early, against the encoder."""
+    entries = {"reference_lag_s": lag.value, "reference_lag_uncertainty_s": lag.uncertainty}
+    if abs(lag.value) <= max(_CLEARLY * lag.uncertainty, _GREATEST_REFERENCE_LAG_S):
+        return Finding(entries)
+    word = "late" if lag.value > 0 else "early"
+    return Finding(
+        entries,
+        {"reference_lag_greatest_s": _GREATEST_REFERENCE_LAG_S},
+        reasons=(
+            f"the reference sensor is {abs(lag.value) * 1e6:.3g} µs {word} against the encoder "
+            f"(u = {lag.uncertainty * 1e6:.1g} µs), and a correction filters the encoder: "
+            "identify with input 'encoder', or remove the filter or averaging of the reference",
+        ),
+    )
 
 
 COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit, FloatArray], CovarianceTerm], ...] = (

@@ -21,7 +21,11 @@ from scipy import stats
 
 from omsm_ros.core.departures.families import CREEP, FASTEST_CREEP_S, MODE, STIFFENING
 from omsm_ros.core.departures.survey import FALSE_ALARM, Judged, Survey
-from omsm_ros.core.dynamics.response_band import relative_response_jacobian
+from omsm_ros.core.dynamics.response_band import (
+    COVERAGE_FACTOR,
+    ResponseLimits,
+    relative_response_jacobian,
+)
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.output_error import Fit
@@ -119,8 +123,12 @@ def _told(survey: Survey, judged: Judged) -> bool:
     return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
 
 
-def hidden_covariance(survey: Survey, settings: Mapping[str, object]) -> list[CovarianceTerm]:
+def hidden_covariance(
+    survey: Survey, settings: Mapping[str, object], limits: ResponseLimits
+) -> list[CovarianceTerm]:
     """Return the terms of the covariance, each with its entry for the certificate.
+
+    limits: of the 95 % band, within which a response is trusted
 
     settings: with "priors", an object of standard uncertainties by the name of a family, a
         term is taken no larger than its prior
@@ -131,10 +139,37 @@ def hidden_covariance(survey: Survey, settings: Mapping[str, object]) -> list[Co
     terms = hidden_terms(survey)
     entries = [_entry(term, priors) for term in terms]
     covariance = [term.covariance(_carried(term, priors)) for term in terms]
-    finding = Finding({"could_hide": entries, "assumed": _assumptions(survey)})
+    open_gain = max((_carried(t, priors) * t.above for t in terms), default=0.0)
+    slow = max((t.parameter for t in terms if t.family == CREEP), default=0.0)
+    finding = gain_above_rest(open_gain, slow, survey.plateau, limits.gain)
+    finding = replace(
+        finding,
+        entries={**finding.entries, "could_hide": entries, "assumed": _assumptions(survey)},
+    )
     return [CovarianceTerm(c) for c in covariance] + [
         CovarianceTerm(np.zeros((_size(survey.fitted),) * 2), finding)
     ]
+
+
+def gain_above_rest(size: float, time_constant: float, plateau: float, limit: float) -> Finding:
+    """Reject a test that leaves the gain of what moves too open against that at rest.
+
+    size: standard uncertainty of it, relative, from a relaxation of ``time_constant`` [s]
+    plateau: time from edge to edge [s];  limit: of the 95 % band, relative
+    """
+    entries = {"gain_above_rest_u": size, "plateau_that_would_tell_s": time_constant}
+    if COVERAGE_FACTOR * size <= limit:
+        return Finding(entries)
+    wide, allowed = 100 * COVERAGE_FACTOR * size, 100 * limit
+    return Finding(
+        entries,
+        reasons=(
+            f"drift or creep leaves the gain of what moves open by {wide:.2g} % against that at "
+            f"rest, at most {allowed:.2g} % are allowed: a relaxation of {time_constant:.2g} s "
+            f"does not show on plateaus of {plateau:.2g} s; let the machine settle and rest "
+            f"{time_constant:.2g} s on each plateau (omsm plan steps --dwell)",
+        ),
+    )
 
 
 def _size(fitted: Fit) -> int:

@@ -24,6 +24,7 @@ from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
 from omsm_ros.core.identification.certificate import certificate_of
 from omsm_ros.core.identification.checks import CHECKS
+from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.hidden_terms import hidden_covariance
@@ -82,7 +83,8 @@ def identify(
     )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
-    hidden = hidden_covariance(searched.survey, settings or {})
+    hidden = hidden_covariance(searched.survey, settings or {}, limits)
+    hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
     known = response_uncertainty(prepared, model, limits, hidden)
     if order:
         known = no_surer(known, prepared, model, choose_model(prepared), limits)

@@ -27,7 +27,8 @@ _SHOWN = {
     "shape", "modal_remainder", "two_mass", "static_gains", "nonparametric_agreement", "samples",
     "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
     "valid_from", "departures", "could_hide", "assumed", "motion_error_m", "reservations",
-    "noise_covariance",
+    "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
+    "reference_lag_uncertainty_s",
 }  # fmt: skip
 
 CertificateEntries = Mapping[str, Any]
@@ -185,6 +186,7 @@ def background_table(certificate: CertificateEntries) -> Table:
             "lag that motion between samples may hide, at most",
             _or_none(certificate.get("inter_sample_delay_bound_s"), "s"),
         ),
+        ("lag of the reference sensor", quantity(certificate.get("reference_lag_s"), "s")),
         ("distance", _POLARITIES.get(polarity, NOTHING) if isinstance(polarity, int) else NOTHING),
     ]
     return Table("Besides the motion", (), known_rows(rows, 1))
@@ -225,7 +227,19 @@ def hidden_table(certificate: CertificateEntries) -> Table:
     return Table(
         "What could hide",
         ("largest size missed (95 %)", "of it on the paper's scan", "in the band"),
-        rows + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
+        rows
+        + known_rows(
+            [
+                (
+                    "plateau that would tell the slowest",
+                    quantity(certificate.get("plateau_that_would_tell_s"), "s"),
+                    "",
+                    "",
+                )
+            ],
+            1,
+        )
+        + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
     )
 
 

@@ -26,7 +26,7 @@ def test_good_evidence_gives_no_reason_and_no_warning():
         separable_gain(1e-5, 0.01),
         trusted_range(80.0, LIMITS),
         requested_order(3, 1.0),
-        poles_beyond(SLOW, 80.0),
+        poles_beyond(SLOW, 80.0, 500.0),
         hidden_motion_finding(1e-8, 1e-6),
     ]
     assert not list(chain.from_iterable(f.reasons + f.warnings for f in good))
@@ -60,7 +60,7 @@ def test_a_bias_of_half_a_microsecond_harms_nobody():
 
 
 def test_a_pole_beyond_the_trusted_band_is_warned_of():
-    (text,) = poles_beyond(FAST, 80.0).warnings
+    (text,) = poles_beyond(FAST, 80.0, 500.0).warnings
     assert "1592 Hz" in text
 
 

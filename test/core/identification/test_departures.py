@@ -1,5 +1,7 @@
 """What hides in a step test: columns against closed forms, and findings against the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -12,6 +14,7 @@ from omsm_ros.core.departures.families import (
     dahl,
     relaxed,
 )
+from omsm_ros.core.departures.reference_lag import reference_lag
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import response_band
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
@@ -20,7 +23,11 @@ from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.departure_checks import agreement, independence
 from omsm_ros.core.identification.departure_search import search
-from omsm_ros.core.identification.hidden_terms import hidden_terms, relaxation_found
+from omsm_ros.core.identification.hidden_terms import (
+    gain_above_rest,
+    hidden_terms,
+    relaxation_found,
+)
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.machine.trajectories import StepTest
@@ -240,3 +247,37 @@ def test_independence_is_uniform_where_nothing_follows():
     values = [survey_of(seed=seed).independence for seed in range(12)]
     assert min(values) > 1e-3
     assert max(values) > 0.3
+
+
+def with_reference(late, noise=2e-9):
+    record, random = record_of(), np.random.default_rng(3)
+    reference = 5e-6 - STEPS.positions(TIME - late).z + random.normal(0, noise, len(TIME))
+    return replace(record, reference=reference)
+
+
+@pytest.mark.parametrize("late", [0.0, 20e-6, 200e-6, -50e-6])
+def test_the_lag_of_a_reference_is_found_whatever_its_sign_and_scale(late):
+    lag = reference_lag(with_reference(late))
+    assert lag.uncertainty < 0.5e-6
+    assert lag.value == pytest.approx(late, abs=5 * lag.uncertainty + 0.01 * abs(late))
+
+
+def test_a_late_reference_rejects_and_names_the_remedy():
+    record = with_reference(200e-6)
+    certificate = identify(record, input="reference").calibration.certificate
+    assert certificate["verdict"] == "rejected"
+    assert any("reference sensor is 20" in reason for reason in certificate["reasons"])
+    assert any("input 'encoder'" in reason for reason in certificate["reasons"])
+
+
+def test_a_reference_on_time_is_accepted():
+    certificate = identify(with_reference(0.0), input="reference").calibration.certificate
+    assert certificate["reasons"] == []
+    assert abs(certificate["reference_lag_s"]) < 1e-6
+
+
+def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell():
+    assert not gain_above_rest(1e-4, 5.0, 0.5, 5e-3).reasons
+    (reason,) = gain_above_rest(1e-2, 5.0, 0.5, 5e-3).reasons
+    assert "2 %" in reason
+    assert "rest 5 s on each plateau" in reason
