@@ -70,7 +70,12 @@ def _identify(args: argparse.Namespace) -> Facts:
     if of_table:
         return _model_facts(_of_table(args), args.out)
     with progress_bar("reading", args.json) as progress:
-        motion = motion_of_bag(args.recording, duration=args.duration, progress=progress)
+        motion = motion_of_bag(
+            args.recording,
+            duration=args.duration,
+            time_lapse=(args.settings or {}).get("time_lapse", 1.0),
+            progress=progress,
+        )
     if args.hold != BAND_LIMITED:
         model = model_of_motion(motion, hold=args.hold, order=args.order, max_delay=args.max_delay)
         return _model_facts(model, args.out)
