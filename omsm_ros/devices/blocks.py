@@ -25,6 +25,8 @@ from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 PERIOD_TOLERANCE = 100 * PPM
 # A device that runs freely at another rate than this is set to another rate.
 RATE_TOLERANCE = 1000 * PPM
+# So is one that tells no time, if its samples arrive at another rate than this.
+ARRIVAL_TOLERANCE = 5000 * PPM
 
 
 class BlockPair(NamedTuple):
@@ -71,7 +73,8 @@ class BlockCutter:
     """Runs → pairs of blocks of ``block_size`` samples; a gap or a restart closes one early.
 
     delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
-    period_deviation: of the last full block's device time from nominal, relative
+    period_deviation: from nominal, relative: of the last full block's device time, or of the
+    arrivals of a device that tells no time
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     """
 
@@ -93,7 +96,8 @@ class BlockCutter:
     @property
     def wrong_rate(self) -> bool:
         """Whether the device runs freely, but not at the rate it was set to."""
-        return self._settings.free_running and abs(self.period_deviation) > RATE_TOLERANCE
+        limit = RATE_TOLERANCE if self._channels.timed else ARRIVAL_TOLERANCE
+        return self._settings.free_running and abs(self.period_deviation) > limit
 
     def add(
         self, runs: Sequence[Run], arrival_ns: int, *, after_silence: bool = False
@@ -154,8 +158,11 @@ class BlockCutter:
         yield self._blocks(samples, first, stamp)
 
     def _check_period(self, samples: Samples) -> None:
+        if not self._channels.timed:
+            self.period_deviation = self._clock.drift or 0.0
+            return
         periods = len(samples) - 1
-        if not self._channels.timed or periods < max(1, self._settings.block_size - 1):
+        if periods < max(1, self._settings.block_size - 1):
             return  # too short to tell a wrong period from jitter
         nominal = periods * self._settings.sample_period
         elapsed = (int(samples["time"][-1]) - int(samples["time"][0])) * NANOSECOND_S

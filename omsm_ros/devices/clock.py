@@ -1,87 +1,154 @@
-"""Device time → host time, through what every arrival proves.
+"""Device time → host time, by a line through all arrivals of the last half minute.
 
-A frame arrives after it was taken, never before: ``arrival - device time`` is the offset
-of the two clocks plus a delay ≥ 0. Its lower envelope is therefore the offset plus the
-*least* delay of the link, untouched by scheduling and buffering of the host.
+What arrives, arrives late and unevenly; what the device counts is even. So host time is
+fitted as ``offset + (1 + drift) · device time``: robustly, since some arrivals are very late,
+and over a window, since crystals change with temperature.
 """
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from collections import deque
 
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S, PPM
+from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
-# Crystals differ by some tens of ppm; the envelope must be able to rise as fast.
-DEFAULT_CREEP = 50 * PPM
-
-# All arrivals later than this for so long are no delay any more: the host's clock was set.
-HOST_STEP_NS = round(100 * MILLISECOND_S * NANOSECONDS_PER_S)
-HOST_STEP_AFTER_NS = 10 * NANOSECONDS_PER_S
+# Long enough to average jitter out, short enough to follow a crystal that warms up [s].
+WINDOW_S = 30.0
+# Arrivals closer than this count as one, their mean: it bounds the fit to 1500 points [s].
+_BIN_S = 0.02
+# Crystals differ by some tens of ppm; it holds the drift until arrivals tell it.
+_DRIFT_SIGMA = 100 * PPM
+# A drift beyond this, by five of its own uncertainties, is no crystal: a device that is played
+# faster than it was recorded, or set to another rate.
+_NO_CRYSTAL = 1000 * PPM
+# Arrivals off the line by more than this, all to one side, for so long: a clock was set [s].
+_STEP_S, _STEP_AFTER_S = 0.02, 2.0
+# A drift is told from so many seconds of arrivals on.
+_TELLING_S = 5.0
+# Huber's constant: 95 % efficient for normal jitter; uniform jitter is not clipped at all.
+_HUBER = 1.5
+_ITERATIONS = 5
+_LEAST_SCALE_S = 1e-6
 
 
 class DeviceClock:
-    """Running minimum of ``arrival - device time`` that rises by ``creep`` [s/s] at most.
+    """Stamps that neither jump nor bunch, and rise strictly whatever the arrivals do.
 
-    A device clock that runs faster than the host's, however much, is followed at once; one
-    that runs slower is followed up to ``creep``. Between arrivals host time is interpolated,
-    so stamps neither jump nor bunch. They rise strictly whatever the arrivals do, also over
-    a restart of the device. A host clock set back is followed at once (stamps stand still
-    until it has caught up), one set forward after ten seconds.
+    A clock that was set, the device's or the host's, is followed after two seconds.
     """
 
-    def __init__(self, creep: float = DEFAULT_CREEP) -> None:
-        if not 0 <= creep < 1:
-            raise ConfigurationError(f"creep {creep!r} s/s, expected 0 to 1")
-        self._creep = creep
+    def __init__(self) -> None:
         self._last_stamp: int | None = None
         self.restart()
 
     def restart(self) -> None:
-        """Forget the offset: the device's clock started anew. Stamps still only rise."""
-        self._latest: _Anchor | None = None
-        self._former: _Anchor | None = None
-        self._near = 0
+        """Forget all arrivals: the device's clock started anew. Stamps still only rise."""
+        # Bins: sums of device time and of delay after the origin [s], and how many.
+        self._bins: deque[tuple[float, float, int]] = deque()
+        self._origin = (0, 0)
+        self._offset = self._slope = 0.0
+        self._span = 0.0
+        self._fitted_at = -np.inf
+        # To which side arrivals have been off, and since when [device, arrival; s].
+        self._astray: tuple[bool, float, float] | None = None
+
+    @property
+    def drift(self) -> float | None:
+        """Host seconds per device second, less one; None before it can be told."""
+        return self._slope if self._span >= _TELLING_S else None
 
     def observe(self, device_ns: int, arrival_ns: int) -> None:
-        """A frame taken at ``device_ns`` was complete at the host at ``arrival_ns``.
+        """A sample taken at ``device_ns`` was at the host at ``arrival_ns``.
 
-        Of frames that arrive together, the last tells most and is enough.
+        Of samples that arrive together, the last tells most and is enough.
         """
-        offset = arrival_ns - device_ns
-        if self._latest is None or device_ns - self._near > HOST_STEP_AFTER_NS:
-            envelope, self._near = offset, device_ns
-        else:
-            rise = math.ceil(self._creep * max(0, device_ns - self._latest.device_ns))
-            envelope = min(offset, self._latest.offset_ns + rise)
-        if offset - envelope < HOST_STEP_NS:
-            self._near = device_ns
-        self._former, self._latest = self._latest, _Anchor(device_ns, envelope)
+        if not self._bins:
+            self._origin = (device_ns, arrival_ns)
+        device = (device_ns - self._origin[0]) * NANOSECOND_S
+        late = (arrival_ns - self._origin[1]) * NANOSECOND_S - device
+        if self._stepped(device, late):
+            self.restart()
+            self.observe(device_ns, arrival_ns)
+            return
+        self._keep(device, late)
+        if len(self._bins) < 50 or device - self._fitted_at > 0.1 or device < self._fitted_at:
+            self._fit()
+            self._fitted_at = device
 
     def to_host(self, device_ns: int) -> int:
         """Host time [ns] of ``device_ns``, later than every stamp given before."""
-        stamp = device_ns + self._offset_at(device_ns)
+        if not self._bins:
+            raise ConfigurationError("DeviceClock.to_host before any arrival; call observe() first")
+        since = device_ns - self._origin[0]
+        late = self._offset + self._slope * (since * NANOSECOND_S)
+        stamp = self._origin[1] + since + round(late * NANOSECONDS_PER_S)
         if self._last_stamp is not None:
             stamp = max(stamp, self._last_stamp + 1)
         self._last_stamp = stamp
         return stamp
 
-    def _offset_at(self, device_ns: int) -> int:
-        if self._latest is None:
-            raise ConfigurationError("DeviceClock.to_host before any arrival; call observe() first")
-        before, after = self._former or self._latest, self._latest
-        if device_ns <= before.device_ns:
-            return before.offset_ns
-        if device_ns >= after.device_ns:
-            return after.offset_ns
-        span = after.device_ns - before.device_ns
-        change = after.offset_ns - before.offset_ns
-        return before.offset_ns + change * (device_ns - before.device_ns) // span
+    def _keep(self, device: float, late: float) -> None:
+        """Add to the last bin, or begin one; forget what the window has left behind."""
+        if self._bins:
+            total, delay, count = self._bins[-1]
+            if 0 <= device - total / count < _BIN_S:
+                self._bins[-1] = (total + device, delay + late, count + 1)
+                return
+        self._bins.append((device, late, 1))
+        while device + late - _arrival(self._bins[0]) > WINDOW_S:
+            self._bins.popleft()
+
+    def _stepped(self, device: float, late: float) -> bool:
+        """Whether arrivals have been off the line, to one side, for too long."""
+        off = late - (self._offset + self._slope * device)
+        side, arrival = bool(off > 0), device + late
+        if not self._bins or abs(off) < _STEP_S:
+            self._astray = None
+        elif self._astray is None or self._astray[0] != side:
+            self._astray = (side, device, arrival)
+        if self._astray is None:
+            return False
+        _, since, arrived = self._astray
+        return min(device - since, arrival - arrived) > _STEP_AFTER_S
+
+    def _fit(self) -> None:
+        """Huber's line through the bins, the drift held by what crystals do."""
+        bins = np.array(self._bins)
+        count = bins[:, 2]
+        device, late = bins[:, 0] / count, bins[:, 1] / count
+        self._span = float(np.ptp(device))
+        # About the middle, offset and drift do not disturb each other.
+        middle = float(device.mean())
+        free = _line(device - middle, late, count, np.inf)
+        beyond = abs(free[1]) - 5 * free[2] > _NO_CRYSTAL and len(count) > 5
+        offset, slope, _ = free if beyond else _line(device - middle, late, count, _DRIFT_SIGMA)
+        self._slope = slope
+        self._offset = offset - slope * middle
 
 
-class _Anchor(NamedTuple):
-    """Host time minus device time [ns] at a device time [ns]."""
+def _arrival(item: tuple[float, float, int]) -> float:
+    return (item[0] + item[1]) / item[2]
 
-    device_ns: int
-    offset_ns: int
+
+def _line(
+    x: FloatArray, y: FloatArray, count: FloatArray, sigma: float
+) -> tuple[float, float, float]:
+    """Offset, slope and its uncertainty of a robust line; sigma: of the slope beforehand."""
+    offset, slope = float(np.median(y)), 0.0
+    weight, scale = count, _LEAST_SCALE_S
+    uncertainty = np.inf
+    for _ in range(_ITERATIONS):
+        residual = y - offset - slope * x
+        scale = max(_LEAST_SCALE_S, 1.4826 * float(np.median(abs(residual))))
+        weight = count * np.minimum(1.0, _HUBER * scale / np.maximum(abs(residual), 1e-12))
+        total = weight.sum()
+        mx, my = float((weight * x).sum() / total), float((weight * y).sum() / total)
+        held = (scale / sigma) ** 2
+        power = float((weight * (x - mx) ** 2).sum()) + held
+        slope = float((weight * (x - mx) * (y - my)).sum()) / power if power > 0 else 0.0
+        offset = my - slope * mx
+        uncertainty = scale / np.sqrt(power) if power > 0 else np.inf
+    return offset, slope, float(uncertainty)

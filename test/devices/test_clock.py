@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.devices.clock import DEFAULT_CREEP, HOST_STEP_AFTER_NS, DeviceClock
+from omsm_ros.devices.clock import DeviceClock
 from omsm_ros.errors import ConfigurationError
 
 MS = 1_000_000
@@ -17,7 +17,7 @@ EPOCH = 1_700_000_000_000_000_000
 
 
 def stamps_of(clock: DeviceClock, device: np.ndarray, arrival: np.ndarray) -> np.ndarray:
-    """What the clock says of each frame, told of it as it arrives."""
+    """What the clock says of each sample, told of it as it arrives."""
     found = []
     for taken, arrived in zip(device.tolist(), arrival.tolist(), strict=True):
         clock.observe(taken, arrived)
@@ -25,54 +25,84 @@ def stamps_of(clock: DeviceClock, device: np.ndarray, arrival: np.ndarray) -> np
     return np.array(found)
 
 
-def link(samples: int, *, rate: float = 1.0, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Device time, true host time and arrival [ns]; the link takes 1 ms and up to 20 more."""
-    device = np.arange(samples, dtype=np.int64) * 5 * MS
-    host = EPOCH + np.rint(device * rate).astype(np.int64)
-    late = np.random.default_rng(seed).exponential(3 * MS, samples).astype(np.int64)
-    return device, host, np.maximum.accumulate(host + 1 * MS + np.minimum(late, 20 * MS))
+def link(
+    samples: int, *, drift: float = 0.0, jitter: float = 1.0, seed: int = 0, step_ms: int = 5
+) -> tuple[np.ndarray, ...]:
+    """Device time, true host time and arrival [ns]: even jitter of ± ``jitter`` ms."""
+    device = np.arange(samples, dtype=np.int64) * step_ms * MS
+    host = EPOCH + np.rint(device * (1 + drift)).astype(np.int64)
+    late = np.random.default_rng(seed).uniform(-jitter, jitter, samples) * MS
+    return device, host, np.maximum.accumulate(host + late.astype(np.int64))
 
 
-def test_jitter_of_the_host_is_not_in_the_stamps() -> None:
-    device, host, arrival = link(4000)
-    error = stamps_of(DeviceClock(), device, arrival) - host
-    settled = error[400:]
-    assert np.ptp(arrival - host) > 10 * MS
-    # The least delay remains, as it must; the envelope creeps between its touches.
-    assert abs(settled - 1 * MS).max() < 0.1 * MS
-
-
-@pytest.mark.parametrize("drift_ppm", [-30.0, 30.0])
-def test_drift_of_the_device_clock_is_followed(drift_ppm: float) -> None:
-    device, host, arrival = link(40_000, rate=1 + drift_ppm * 1e-6)
-    error = (stamps_of(DeviceClock(), device, arrival) - host)[400:]
-    assert abs((host - device - EPOCH)[-1]) > 5 * MS
-    assert abs(error - 1 * MS).max() < 0.2 * MS
-
-
-@pytest.mark.parametrize("lapse", [5.0, 40.0])
-def test_time_lapse_is_followed(lapse: float) -> None:
-    device, host, arrival = link(2000, rate=1 / lapse)
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("drift_ppm", [-50.0, 0.0, 50.0])
+def test_within_a_tenth_of_a_millisecond_after_ten_seconds(drift_ppm: float, seed: int) -> None:
+    device, host, arrival = link(8000, drift=drift_ppm * 1e-6, seed=seed)
     stamps = stamps_of(DeviceClock(), device, arrival)
-    assert abs(stamps - host)[10:].max() <= 21 * MS
+    error = (stamps - host)[2000:]
+    assert abs(error).max() < 0.1 * MS
+    assert np.all(np.diff(stamps) > 0)
+
+
+def test_through_a_reconnection_too() -> None:
+    device, host, arrival = link(12_000, drift=50e-6, seed=9)
+    kept = np.r_[0:4000, 5000:12_000]  # five seconds of nothing
+    stamps = stamps_of(DeviceClock(), device[kept], arrival[kept])
+    assert abs(stamps - host[kept])[2000:].max() < 0.1 * MS
+    assert np.all(np.diff(stamps) > 0)
+
+
+def test_late_arrivals_of_a_busy_host_do_not_pull() -> None:
+    device, host, arrival = link(8000, jitter=0.2)
+    random = np.random.default_rng(1)
+    late = np.where(random.random(8000) < 0.1, random.exponential(20 * MS, 8000), 0)
+    arrival = np.maximum.accumulate(arrival + late.astype(np.int64))
+    # Samples that arrive together are one arrival, that of the last.
+    last = np.r_[np.diff(arrival) > 0, True]
+    device, host, arrival = device[last], host[last], arrival[last]
+    stamps = stamps_of(DeviceClock(), device, arrival)
+    assert np.ptp(arrival - host) > 20 * MS
+    assert abs(stamps - host)[2000:].max() < 1.0 * MS
+
+
+def test_a_drift_that_changes_is_followed() -> None:
+    """A crystal that warms up by 10 ppm in five minutes."""
+    device = np.arange(60_000, dtype=np.int64) * 5 * MS
+    seconds = device * 1e-9
+    host = EPOCH + device + np.rint(1e9 * 10e-6 * seconds**2 / 600).astype(np.int64)
+    jitter = np.random.default_rng(2).uniform(-1, 1, len(device)) * MS
+    stamps = stamps_of(DeviceClock(), device, np.maximum.accumulate(host + jitter.astype(np.int64)))
+    assert abs(stamps - host)[4000:].max() < 0.1 * MS
+
+
+def test_the_drift_is_told() -> None:
+    device, _, arrival = link(4000, drift=50e-6)
+    clock = DeviceClock()
+    stamps_of(clock, device[:100], arrival[:100])
+    assert clock.drift is None
+    stamps_of(clock, device[100:], arrival[100:])
+    assert clock.drift == pytest.approx(50e-6, abs=10e-6)
+
+
+@pytest.mark.parametrize("rate", [0.9, 1.1, 1 / 20])
+def test_a_device_at_another_rate_is_followed_and_told(rate: float) -> None:
+    device, host, arrival = link(4000, drift=rate - 1)
+    clock = DeviceClock()
+    stamps = stamps_of(clock, device, arrival)
+    assert clock.drift == pytest.approx(rate - 1, abs=1e-4)
+    assert abs(stamps - host)[2000:].max() < 1 * MS
 
 
 def test_stamps_between_arrivals_neither_jump_nor_bunch() -> None:
-    """At forty-fold speed, frames between two arrivals share the time between them evenly."""
+    device, _, arrival = link(3000)
     clock = DeviceClock()
-    clock.observe(0, EPOCH)
-    clock.observe(400 * MS, EPOCH + 10 * MS)
-    inside = [clock.to_host(t * MS) - EPOCH for t in (100, 200, 300, 400)]
-    assert inside == [2_500_000, 5_000_000, 7_500_000, 10_000_000]
+    stamps_of(clock, device, arrival)
+    inside = [clock.to_host(int(device[-1]) + t * MS) for t in range(1, 6)]
+    np.testing.assert_allclose(np.diff(inside), MS, rtol=1e-3)
 
 
-def test_extrapolation_runs_at_the_device_rate() -> None:
-    clock = DeviceClock()
-    clock.observe(10 * MS, EPOCH)
-    assert clock.to_host(3 * MS) == EPOCH - 7 * MS
-    assert clock.to_host(15 * MS) == EPOCH + 5 * MS
-
-
+@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 2**40), st.integers(-(2**40), 2**40), st.booleans()), min_size=1
@@ -89,17 +119,6 @@ def test_stamps_rise_whatever_comes(events: list[tuple[int, int, bool]]) -> None
     assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
 
 
-@given(st.lists(st.tuples(st.integers(0, 10**8), st.integers(0, 10**8)), min_size=1, max_size=50))
-def test_no_stamp_is_later_than_the_arrival(steps: list[tuple[int, int]]) -> None:
-    """Causality: a frame was taken before it came, unless the host's clock fell back."""
-    clock = DeviceClock()
-    device = arrival = 0
-    for taken, arrived in steps:
-        device, arrival = device + taken + 1, arrival + arrived + 1
-        clock.observe(device, arrival)
-        assert clock.to_host(device) <= arrival
-
-
 def test_a_restarted_device_gets_a_new_offset() -> None:
     clock = DeviceClock()
     clock.observe(50_000 * MS, EPOCH)
@@ -109,32 +128,26 @@ def test_a_restarted_device_gets_a_new_offset() -> None:
     assert clock.to_host(0) == EPOCH + 2000 * MS
 
 
-def test_host_clock_set_forward_is_followed_after_a_while() -> None:
+@pytest.mark.parametrize("step_ms", [3_600_000, -3_600_000, 50])
+def test_a_clock_that_was_set_is_followed_after_a_while(step_ms: int) -> None:
     device, _, arrival = link(6000)
-    arrival[1000:] += 3_600_000 * MS
-    stamps = stamps_of(DeviceClock(), device, arrival)
-    delay = arrival - stamps
-    assert delay[1001] > 3_500_000 * MS
-    after = 1000 + 2 * HOST_STEP_AFTER_NS // (5 * MS)
-    assert delay[after:].max() < 25 * MS
+    arrival[2000:] += step_ms * MS
+    clock = DeviceClock()
+    found = []
+    for taken, arrived in zip(device.tolist(), arrival.tolist(), strict=True):
+        clock.observe(taken, arrived)
+        found.append(clock._origin[1] + taken - clock._origin[0] + round(clock._offset * 1e9))
+    after = 2000 + 2500 // 5
+    assert abs(np.array(found) - arrival)[after:].max() < 5 * MS
 
 
 def test_a_stall_of_the_host_moves_nothing() -> None:
-    device, host, arrival = link(3000)
-    arrival[1000:1400] = np.maximum(arrival[1000:1400], host[1400])
-    error = (stamps_of(DeviceClock(), device, arrival) - host)[400:]
-    assert abs(error - 1 * MS).max() < 0.3 * MS
-
-
-def test_creep_is_the_slope_of_the_envelope() -> None:
-    clock = DeviceClock()
-    clock.observe(0, EPOCH)
-    clock.observe(1000 * MS, EPOCH + 1500 * MS)
-    assert clock.to_host(1000 * MS) - EPOCH - 1000 * MS == pytest.approx(1000 * MS * DEFAULT_CREEP)
+    device, host, arrival = link(5000)
+    arrival[3000:3200] = np.maximum(arrival[3000:3200], host[3200])
+    error = stamps_of(DeviceClock(), device, arrival) - host
+    assert abs(error[2000:]).max() < 1 * MS
 
 
 def test_misuse_is_named() -> None:
-    with pytest.raises(ConfigurationError, match=r"creep 1\.5"):
-        DeviceClock(creep=1.5)
     with pytest.raises(ConfigurationError, match="observe"):
         DeviceClock().to_host(0)
