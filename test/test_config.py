@@ -20,6 +20,7 @@ NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PAR
 
 TABLES = {
     "confocal_driver": factory.PARAMETERS,
+    "axis_driver": factory.AXIS_PARAMETERS,
     "reference_driver": factory.REFERENCE_PARAMETERS,
 }
 

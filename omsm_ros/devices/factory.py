@@ -17,11 +17,13 @@ from omsm_ros.devices.confocaldt import (
     ConfocalDtEthernetDevice,
     ConfocalDtSettings,
 )
+from omsm_ros.devices.csv_stream import CsvSettings, CsvStreamDevice
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.protocols.csv_stream import COLUMNS
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling, ProbeScaling, StreamScaling
 
 Values: TypeAlias = Mapping[str, Any]
@@ -55,6 +57,7 @@ PARAMETERS = (
             Parameter(f"{name}.wrap", axis.wrap, "counts at which it wraps; 0 = as the device"),
         )
     ),
+    Parameter("columns", " ".join(COLUMNS), "of a line of text; - = one to pass over"),
     Parameter("probe.full_scale", _USUAL.probe.full_scale, "measuring range [m]"),
     Parameter("probe.polarity", _USUAL.probe.polarity, "+1: falls as z rises; -1: reversed"),
     Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
@@ -76,6 +79,14 @@ PARAMETERS = (
     Parameter("sensor_head", -1, "0-15; negative = as the device has it"),
 )
 
+
+# Axes alone: the same streams, whose distance, if they have one, is left out.
+_AXIS_NAMES = ("device", "port", "baud_rate", "sample_period", "block_size", "columns")
+AXIS_PARAMETERS = tuple(
+    parameter
+    for parameter in PARAMETERS
+    if parameter.name in _AXIS_NAMES or parameter.name[:2] in ("x.", "y.", "z.", "b.", "c.")
+)
 
 REFERENCE_PARAMETERS = (
     Parameter("device", "capancdt", "what is connected: see the table of devices"),
@@ -105,6 +116,17 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
     if make is None:
         raise ConfigurationError(f"device {values['device']!r}, expected one of {sorted(DEVICES)}")
     return make(values, transport_for(values["port"], values["baud_rate"]), now_ns)
+
+
+def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
+    """The stream of axes that ``values`` describe, not yet connected.
+
+    values: every name of AXIS_PARAMETERS. Raises ConfigurationError.
+    """
+    streams = ("six_channel", "six_channel_text")
+    if values["device"] not in streams:
+        raise ConfigurationError(f"device {values['device']!r}, expected one of {streams}")
+    return make_device(defaults() | dict(values), now_ns)
 
 
 def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
@@ -142,6 +164,14 @@ def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamD
     scaling = StreamScaling(**_axes(values), probe=probe)
     settings = StreamSettings(**_blocks(values), scaling=scaling)
     return GenericStreamDevice(transport, settings, now_ns)
+
+
+def _six_channel_text(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
+    probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
+    scaling = StreamScaling(**_axes(values), probe=probe)
+    columns = tuple(values["columns"].replace(",", " ").split())
+    settings = CsvSettings(**_blocks(values), columns=columns, scaling=scaling)
+    return CsvStreamDevice(transport, settings, now_ns)
 
 
 def _chrocodile(
@@ -230,6 +260,7 @@ def _unless_negative(value: Any) -> Any:
 
 DEVICES: dict[str, Callable[[Values, Transport, NowNs], StreamDevice]] = {
     "six_channel": _six_channel,
+    "six_channel_text": _six_channel_text,
     "chrocodile": partial(_chrocodile, ChrocodileDevice),
     "chrocodile_packet": partial(_chrocodile, ChrocodilePacketDevice),
     "confocaldt": _confocaldt,

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
 from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
+from omsm_ros.emulators.csv_stream import CsvStreamEmulator
 from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
 from omsm_ros.emulators.instrument import Instrument, Line
 from omsm_ros.emulators.micro_epsilon import ConfocalDtEmulator
@@ -149,6 +150,10 @@ def _confocaldt_ethernet(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(emulator)
 
 
+def _csv(line: Line, faults: Faults) -> Player:
+    return InstrumentPlayer(CsvStreamEmulator(line, triggered=True, seed=faults.seed))
+
+
 _OWN_ENCODERS: dict[str, object] = {
     "encoders": "XYZUV",
     "trigger": "each",
@@ -160,6 +165,7 @@ _OWN_ENCODERS: dict[str, object] = {
 
 EMULATED = {
     "six_channel": Emulated(StreamPlayer, {}),
+    "six_channel_text": Emulated(_csv, {}),
     "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
     "chrocodile_packet": Emulated(_chrocodile_packet, _OWN_ENCODERS, tcp=True),
     # Y and B stand still in the twin's motions: three encoders are enough.

@@ -7,11 +7,13 @@ from typing import Any
 import pytest
 
 from omsm_ros.devices.factory import (
+    AXIS_PARAMETERS,
     DEVICES,
     PARAMETERS,
     REFERENCE_PARAMETERS,
     command_transport,
     defaults,
+    make_axes,
     make_device,
     make_reference,
 )
@@ -73,3 +75,13 @@ def test_commands_go_to_the_same_host() -> None:
     assert command_transport("tcp://10.0.0.7:1024", 0) is None
     with pytest.raises(ConfigurationError, match="needs a port tcp://"):
         command_transport("/dev/ttyUSB0", 23)
+
+
+def test_axes_alone_are_made_from_their_defaults() -> None:
+    values = defaults(AXIS_PARAMETERS) | {"columns": "sequence x y z b c"}
+    device = make_axes(values | {"device": "six_channel_text"})
+    assert not device.channels.distance
+    with pytest.raises(ConfigurationError, match="device 'chrocodile'"):
+        make_axes(values | {"device": "chrocodile"})
+    with pytest.raises(ConfigurationError, match="columns"):
+        make_axes(values | {"device": "six_channel_text", "columns": "x y"})

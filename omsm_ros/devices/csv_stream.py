@@ -1,0 +1,89 @@
+"""The six-channel stream as text, from a transport to blocks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import Status
+from omsm_ros.devices.blocks import BlockSettings, Channels
+from omsm_ros.devices.counting import SAMPLE, Counting, Samples
+from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.transport import Transport
+from omsm_ros.protocols.csv_stream import AXIS_COLUMNS, COLUMNS, CsvDecoder
+from omsm_ros.protocols.generic_stream import AxisScaling, StreamScaling
+from omsm_ros.units import NANOMETRE_M
+
+# Text may carry decimals of a count: so many parts of it are kept.
+_PARTS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CsvSettings(BlockSettings):
+    """columns: of a line, in order;  scaling: counts ↔ SI;  modulus: where the sequence wraps.
+
+    An axis without a column stands at its offset.
+    """
+
+    columns: tuple[str, ...] = COLUMNS
+    scaling: StreamScaling = field(default_factory=StreamScaling)
+    modulus: int = 2**32
+
+
+class CsvStreamDevice(StreamDevice):
+    """Reads lines; the sender needs no setting up."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: CsvSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        settings = settings or CsvSettings()
+        self._decoder = CsvDecoder(settings.columns)
+        self._columns, self._probe = settings.columns, settings.scaling.probe
+        timed = "device_time" in settings.columns
+        has_axes = bool(set(AXIS_COLUMNS) & set(settings.columns))
+        axes = tuple(map(_in_parts, settings.scaling.axes)) if has_axes else None
+        channels = Channels("distance" in settings.columns, axes, timed)
+        counting = Counting(settings.modulus, timed=timed, checked=False)
+        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+
+    def _decode(self, data: bytes) -> Samples:
+        rows = self._decoder.feed(data)
+        samples = np.zeros(len(rows), SAMPLE)
+        samples["counter"] = rows["sequence"]
+        samples["intensity"] = np.nan
+        if self.channels.timed:
+            samples["time"] = rows["device_time"]
+        if "distance" in self._columns:
+            told = rows["distance"] != self._probe.invalid
+            raw = np.where(told, rows["distance"], np.nan)
+            samples["distance"] = self._probe.polarity * NANOMETRE_M * raw
+            given = rows["status"] if "status" in self._columns else Status.OK
+            known = np.where((given >= 0) & (given <= max(Status)), given, Status.LOST)
+            good = known == Status.OK
+            beyond = good & (abs(samples["distance"]) > self._probe.full_scale)
+            known = np.where(beyond, Status.OUT_OF_RANGE, known)
+            samples["status"] = np.where(good & ~told, Status.NO_TARGET, known)
+        for index, name in enumerate(AXIS_COLUMNS):
+            if name in self._columns:
+                inside = np.clip(rows[name], -(2**40), 2**40)
+                samples["counts"][:, index] = np.rint(inside * _PARTS).astype(np.int64)
+        return samples
+
+
+def _in_parts(axis: AxisScaling) -> AxisScaling:
+    """The same axis, counted in parts of a count."""
+    return replace(axis, counts_per_unit=axis.counts_per_unit * _PARTS, wrap=axis.wrap * _PARTS)

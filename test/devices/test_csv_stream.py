@@ -1,0 +1,65 @@
+"""The driver of the text stream against its emulator, and the columns of LinuxCNC."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from omsm_ros.devices.csv_stream import CsvSettings, CsvStreamDevice
+from omsm_ros.emulators.csv_stream import CsvStreamEmulator
+from omsm_ros.emulators.instrument import Instrument
+from omsm_ros.protocols.generic_stream import AxisScaling, StreamScaling
+
+
+@pytest.mark.parametrize("portion", [1 << 20, 7])
+def test_every_sample_arrives_once_with_its_counter(bench: Any, portion: int) -> None:
+    run = bench(CsvStreamEmulator, CsvStreamDevice, CsvSettings(), portion=portion)
+    run.run(1.0)
+    run.instrument.faults.lose = 5
+    run.run(0.5)
+    run.instrument.faults.duplicate = 5
+    run.run(0.5)
+    run.end()
+    run.check()
+    assert run.device.statistics.lost == 5
+    assert run.device.statistics.duplicates == 5
+
+
+@pytest.mark.parametrize("fault", ["unplug", "power_cycle", "stall"])
+def test_it_comes_back(bench: Any, fault: str) -> None:
+    run = bench(CsvStreamEmulator, CsvStreamDevice, CsvSettings())
+    run.run(1.0)
+    getattr(run.instrument, fault)(1.0)
+    run.run(4.0)
+    before = run.delivered
+    run.run(1.0)
+    assert run.delivered >= before + 900
+    run.end()
+    run.check()
+    assert run.device.statistics.restarts == (fault == "power_cycle")
+
+
+class Halsampler(Instrument):
+    """Axes in millimetres, as LinuxCNC has them."""
+
+    counter_range = 2**32
+
+    def pack(self, measured: Any, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        z = measured.axes["z"] * 1e3
+        return [b"%d %.9f 0 \n" % (n, v) for n, v in zip(counters, z, strict=True)]
+
+
+def test_axes_in_millimetres_without_a_probe(bench: Any) -> None:
+    millimetres = AxisScaling(counts_per_unit=1e3)
+    scaling = StreamScaling(x=AxisScaling(1.0, offset=0.25), z=millimetres)
+    settings = CsvSettings(columns=("sequence", "z", "-"), scaling=scaling)
+    run = bench(Halsampler, CsvStreamDevice, settings)
+    run.run(0.5)
+    run.end()
+    for block in run.blocks:
+        assert block.distance is None
+        k = block.axes.first_sample + np.arange(len(block.axes))
+        np.testing.assert_allclose(block.axes.z, k % 1000 * 1e-6, atol=1e-9)
+        assert (block.axes.x == 0.25).all()
