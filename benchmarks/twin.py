@@ -22,8 +22,9 @@ from omsm_ros.units import NANOMETRE_M
 _RUNS = 3
 
 
-def rows() -> Iterator[Row]:
+def rows(full: bool) -> Iterator[Row]:
     """Processor time of the paper's motions, and what half the simulation's step would change."""
+    del full  # it takes a minute
     everything, count = everything_at_once()
     scenario = Scenario()
     for name, make, clean, disturbed in (
@@ -76,10 +77,3 @@ def _halving(disturbances: Disturbances) -> float:
         for n in (16, 32)
     )
     return float(np.nanmax(abs(coarse - fine)))
-
-
-if __name__ == "__main__":
-    from benchmarks.__main__ import show
-
-    for row in rows():
-        show(row)
