@@ -14,7 +14,7 @@ from omsm_ros.devices import factory
 from omsm_ros.storage.machine_files import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
-NO_PARAMETERS = {"paper_mirror", "disturbances"}
+NO_PARAMETERS = {"paper_mirror", "disturbances", "limits"}
 NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PARAMETERS)
 
 
