@@ -158,6 +158,7 @@ LENGTH = Quantity("length", "m", -10.0, 10.0, "give it in metres")
 RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if convex", signed=True)
 FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
 SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
+MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 
 # --------------------------------------------------------------------------- uncertainty

@@ -148,7 +148,7 @@ PATHS = st.sampled_from([
 ])  # fmt: skip
 _FLAGS = {
     "inspect": [],
-    "predict": ["--calibration", "--budget"],
+    "predict": ["--calibration", "--budget", "--limits"],
     "correct": [
         "--calibration", "--out", "--nominal", "--geometry", "--lateral-lag", "--sources",
         "--lateral", "--settings", "--by-stamps", "--delay", "--exposure", "--polarity",
@@ -163,7 +163,7 @@ _FLAGS = {
 _POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2}
 _SWITCHES = {"--by-stamps", "--override"}
 _GOOD = {"--calibration": "cal.json", "--out": "out", "--radius": "0.1"}
-_FILES = {"--calibration", "--out", "--nominal", "--geometry"}
+_FILES = {"--calibration", "--out", "--nominal", "--geometry", "--limits"}
 
 
 @st.composite
@@ -188,11 +188,21 @@ def arguments(draw: st.DrawFn) -> Case:
     return Case((*words, "--json"))
 
 
+_SETTING_NAMES = st.sampled_from(
+    ["probe_noise", "pitch", "machine", "static_gain", "table_mass_kg", "lag_is_latency"]
+)
+SETTINGS = st.one_of(
+    st.dictionaries(st.one_of(_SETTING_NAMES, TEXTS), VALUES, max_size=3).map(json.dumps),
+    st.tuples(_SETTING_NAMES, NUMBERS).map(lambda pair: json.dumps(dict([pair]))),
+    VALUES.map(json.dumps),
+    TEXTS,
+    st.just("[" * 5000),
+)
+
+
 def _value_of(flag: str) -> st.SearchStrategy[str]:
     if flag in _FILES:
         return PATHS
     if flag in ("--settings", "--sources"):
-        named = st.sampled_from(["probe_noise", "pitch", "machine", "static_gain"])
-        objects = st.dictionaries(st.one_of(named, TEXTS), VALUES, max_size=3).map(json.dumps)
-        return st.one_of(objects, VALUES.map(json.dumps), TEXTS, st.just("[" * 5000))
+        return SETTINGS
     return st.one_of(NUMBERS.map(str), NUMBERS.map(repr), TEXTS)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.correction.motion_filter import ABSURD, MotionFilter, MotionFilters
+from omsm_ros.core.correction.motion_filter import MotionFilter, MotionFilters
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -256,6 +256,5 @@ def _axes_run(block: AxisBlock, arrival: Arrival) -> Run:
 
 def _distance_run(block: DistanceBlock, arrival: Arrival) -> Run:
     intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
-    usable = block.ok & (abs(block.distance) < ABSURD)
-    reasons = np.where(usable, Reason.NONE, Reason.INVALID).astype(np.uint8)
+    reasons = np.where(block.ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
     return Run.of(block, arrival, reasons, np.array([block.distance, intensity], np.float64))

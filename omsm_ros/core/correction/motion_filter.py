@@ -26,8 +26,6 @@ _MIN_START_SAMPLES = 12
 _X, _Y, _Z, _B, _C = range(5)
 _LATERAL = (_X, _Y, _B, _C)
 _OUTPUTS = 8
-# No length [m] and no angle [rad] is this large; such numbers would overflow on the way.
-ABSURD = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +100,7 @@ class MotionFilter:
         """Filter a run that follows the last one or comes after a gap."""
         done = [] if (run.session, run.first) == self._next else self.end()
         self._next = (run.session, run.end)
-        finite: BoolArray = np.all(abs(run.values) < ABSURD, axis=0)
+        finite: BoolArray = np.all(np.isfinite(run.values), axis=0)
         if finite.all():
             return done + self._push_finite(run)
         edges = np.flatnonzero(np.diff(finite)) + 1

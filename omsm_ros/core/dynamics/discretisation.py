@@ -20,6 +20,7 @@ from omsm_ros.core.dynamics.second_order_sections import bilinear_roots, second_
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.quantities import SAMPLE_PERIOD
 from omsm_ros.scipy_parts import sosfilt
 
 DEFAULT_ORDER = 3
@@ -79,8 +80,7 @@ def discretise(
     """
     if not 1 <= order <= 7:
         raise ConfigurationError(f"interpolation order {order!r}, expected 1 to 7")
-    if not (np.isfinite(sample_period) and sample_period > 0):
-        raise ConfigurationError(f"sample_period {sample_period!r} s, expected a positive number")
+    SAMPLE_PERIOD.checked(sample_period, ConfigurationError, "sample_period")
     continuous = (dynamics.poles() if poles is None else poles) * sample_period
     at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
     zeros = held_zeros(dynamics.zeros() * sample_period, continuous, order, at_rest)

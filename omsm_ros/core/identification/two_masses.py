@@ -11,6 +11,7 @@ from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMassFit, fit_tw
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import MASS
 
 # The setting without which masses, springs and dampers are known only per mass of the table.
 TABLE_MASS_SETTING = "table_mass_kg"
@@ -25,17 +26,12 @@ _GREATEST_UNCERTAINTY = 0.5
 def table_mass(settings: Mapping[str, object]) -> float | None:
     """The moving mass of the table [kg] among the settings, or None if it is not there.
 
-    Raises ConfigurationError unless it is a positive number.
+    Raises ConfigurationError unless it is the mass of a table.
     """
     value = settings.get(TABLE_MASS_SETTING)
     if value is None:
         return None
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (number and np.isfinite(float(str(value))) and float(str(value)) > 0):
-        raise ConfigurationError(
-            f"setting {TABLE_MASS_SETTING!r} is {value!r}, expected a positive number of kilograms"
-        )
-    return float(str(value))
+    return float(MASS.checked(value, ConfigurationError, f"setting {TABLE_MASS_SETTING!r}"))
 
 
 def two_mass_entry(

@@ -18,6 +18,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBl
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import SAMPLE_PERIOD
 
 # Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
 MAX_RECORD_SAMPLES = 20_000_000
@@ -57,10 +58,7 @@ class MotionRecord:
         lengths = sorted({len(a) for a in arrays})
         if len(lengths) != 1:
             raise DataError(f"record: channels of different lengths {lengths!r}")
-        if not (np.isfinite(self.sample_period) and self.sample_period > 0):
-            raise DataError(
-                f"record: sample_period {self.sample_period!r} s, expected a positive number"
-            )
+        SAMPLE_PERIOD.checked(self.sample_period, DataError, "record: sample_period")
 
     def __len__(self) -> int:
         return len(self.z)
