@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from omsm_ros.core.dynamics.calibration import REJECTED
 from omsm_ros.jobs.read_bag import Progress, no_progress
 
 Facts: TypeAlias = "dict[str, Any]"
@@ -47,6 +48,19 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Progress]:
             bar.update(done - bar.n)
 
         yield advance
+
+
+def kept_at(out: Path, verdict: str) -> Path:
+    """Where to write a result: a rejected one never takes the place of a good one."""
+    return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
+
+
+def rejected(facts: Facts) -> str:
+    """Why a calibration or model, told by its facts, was rejected; empty if it was not."""
+    if facts["verdict"] != REJECTED:
+        return ""
+    kept = facts.get("calibration") or facts["model"]
+    return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {kept!r}"
 
 
 def table(rows: list[tuple[str, str]]) -> None:

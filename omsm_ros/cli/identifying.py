@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
-from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.sampled.identify_samples import HOLDS
 from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
@@ -81,7 +81,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         return _model_facts(model, args.out)
     identified = identify(motion, order=args.order, input=args.input, settings=args.settings)
     facts = calibration_facts(identified.calibration)
-    path = _path_for(args.out, facts["verdict"])
+    path = kept_at(args.out, facts["verdict"])
     save_calibration(path, identified.calibration)
     facts["calibration"] = str(path)
     if args.report is not None:
@@ -126,13 +126,8 @@ def _of_table(args: argparse.Namespace) -> SampledModel:
     )
 
 
-def _path_for(out: Path, verdict: str) -> Path:
-    """A rejected calibration never takes the place of a good one."""
-    return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
-
-
 def _model_facts(model: SampledModel, out: Path) -> Facts:
-    path = _path_for(out, str(model.certificate["verdict"]))
+    path = kept_at(out, str(model.certificate["verdict"]))
     save_model(path, model)
     return {
         **model.certificate,
@@ -156,13 +151,6 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "static_gain": calibration.static_gain,
         "valid_up_to": calibration.valid_up_to,
     }
-
-
-def _refusal(facts: Facts) -> str:
-    if facts["verdict"] != REJECTED:
-        return ""
-    kept = facts.get("calibration") or facts["model"]
-    return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {kept!r}"
 
 
 def _show(facts: Facts) -> None:
@@ -189,5 +177,5 @@ def _show(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("identify", "identify G_m from a recording", _declare, _identify, _show, _refusal),
+    Command("identify", "identify G_m from a recording", _declare, _identify, _show, rejected),
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
@@ -75,7 +75,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
     )
     with progress_bar("reading", args.json) as progress:
         found, made, accounts = self_calibration_of(args.scans, step_test, options, progress)
-    save_calibration(args.out, made)
+    path = _kept(args.out, made)
     return {
         **_resolved_facts(made),
         "residual": found.residual,
@@ -84,8 +84,15 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "not_told": untold(found),
         "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
         "samples": [account.as_dict() for account in accounts],
-        "calibration": str(args.out),
+        "calibration": str(path),
     }
+
+
+def _kept(out: Path, calibration: Calibration) -> Path:
+    """Write the calibration, and return where."""
+    path = kept_at(out, verdict_of(calibration)[0])
+    save_calibration(path, calibration)
+    return path
 
 
 def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
@@ -156,8 +163,7 @@ def _reversal(args: argparse.Namespace) -> Facts:
     facts["points"] = sum(account.axes.corrected for account in accounts)
     facts["samples"] = [account.as_dict() for account in accounts]
     if args.out:
-        save_calibration(args.out, found.calibration)
-        facts["calibration"] = str(args.out)
+        facts["calibration"] = str(_kept(args.out, found.calibration))
     return facts
 
 
@@ -198,8 +204,8 @@ def _latency(args: argparse.Namespace) -> Facts:
     lag = calibration.dynamics.low_frequency_delay
     latency = declared(lag, args.delay, args.uncertainty, args.reason)
     made = with_latency(calibration, latency)
-    save_calibration(args.out, made)
-    return {**_resolved_facts(made), "calibration": str(args.out)}
+    path = _kept(args.out, made)
+    return {**_resolved_facts(made), "calibration": str(path)}
 
 
 def _show_latency(facts: Facts) -> None:
@@ -219,6 +225,7 @@ COMMANDS = (
         _declare_selfcal,
         _selfcal,
         _show_selfcal,
+        rejected,
     ),
     Command(
         "reversal",
@@ -233,5 +240,6 @@ COMMANDS = (
         _declare_latency,
         _latency,
         _show_latency,
+        rejected,
     ),
 )

@@ -154,15 +154,28 @@ _FLAGS = {
         "--lateral", "--settings", "--by-stamps", "--delay", "--exposure", "--polarity",
         "--override",
     ],
-    "reversal": ["--calibration"],
+    "reversal": ["--calibration", "--out"],
     "align": ["--calibration", "--radius", "--geometry", "--out"],
     "plan": ["--out", "--sample-period", "--step", "--count", "--dwell", "--rise", "--half-range"],
     "verify": ["--calibration"],
     "compare": [],
+    "selfcal": [
+        "--calibration", "--out", "--harmonics", "--clocking", "--polarity", "--static-gain",
+        "--gain-uncertainty", "--settings",
+    ],
+    "latency": ["--delay", "--uncertainty", "--reason", "--out"],
 }  # fmt: skip
-_POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2}
+_POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2, "selfcal": 2}
+_FIRST = {"plan": "steps", "compare": "cal.json", "latency": "cal.json"}
 _SWITCHES = {"--by-stamps", "--override"}
-_GOOD = {"--calibration": "cal.json", "--out": "out", "--radius": "0.1"}
+_GOOD = {
+    "--calibration": "cal.json",
+    "--out": "out",
+    "--radius": "0.1",
+    "--delay": "1e-4",
+    "--uncertainty": "1e-5",
+    "--reason": "datasheet",
+}
 _FILES = {"--calibration", "--out", "--nominal", "--geometry", "--limits"}
 
 
@@ -172,7 +185,9 @@ def arguments(draw: st.DrawFn) -> Case:
     command = draw(st.sampled_from(sorted(_FLAGS)))
     words = [command]
     for _ in range(_POSITIONALS.get(command, 1)):
-        good = {"plan": "steps", "compare": "cal.json"}.get(command, "scan.mcap")
+        good = {"plan": "steps", "compare": "cal.json", "latency": "cal.json"}.get(
+            command, "scan.mcap"
+        )
         words.append(draw(st.one_of(st.just(good), PATHS)))
     needed = [flag for flag in _FLAGS[command] if flag in _GOOD]
     others = draw(st.lists(st.sampled_from(_FLAGS[command] or ["--json"]), max_size=3))
