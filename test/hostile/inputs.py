@@ -185,9 +185,7 @@ def arguments(draw: st.DrawFn) -> Case:
     command = draw(st.sampled_from(sorted(_FLAGS)))
     words = [command]
     for _ in range(_POSITIONALS.get(command, 1)):
-        good = {"plan": "steps", "compare": "cal.json", "latency": "cal.json"}.get(
-            command, "scan.mcap"
-        )
+        good = _FIRST.get(command, "scan.mcap")
         words.append(draw(st.one_of(st.just(good), PATHS)))
     needed = [flag for flag in _FLAGS[command] if flag in _GOOD]
     others = draw(st.lists(st.sampled_from(_FLAGS[command] or ["--json"]), max_size=3))
