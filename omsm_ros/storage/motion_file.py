@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,8 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import POSITION, SAMPLE_PERIOD, TIME
-from omsm_ros.storage.files import read_text, said
+from omsm_ros.storage.files import read_text
+from omsm_ros.storage.table_file import numbers_in
 
 # Two hours at 1 kHz, in three hundred megabytes of memory.
 MAX_MOTION_BYTES = 200_000_000
@@ -24,14 +23,7 @@ def load_motion(path: Path | str) -> tuple[FloatArray, float]:
     """
     text = read_text(path, MAX_MOTION_BYTES, FileError, "motion")
     what = f"motion {str(path)!r}"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that it is empty, which is said below
-            table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2)
-    except ValueError as err:
-        raise FileError(
-            f"{what} is no table: {said(err)}; write a line 'time_s,z_m', then two numbers a line"
-        ) from err
+    table = numbers_in(text.partition("\n")[2], what)
     if table.shape[0] < 2 or table.shape[1] != 2:
         raise FileError(f"{what} holds {table.shape!r} values, expected two columns time_s,z_m")
     time = TIME.checked_all(table[:, 0], FileError, f"{what}: time_s")

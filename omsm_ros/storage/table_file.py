@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,15 +34,25 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
                 f"{shown(head.strip())}; name columns as that line does, each once"
             )
     places = [known.index(name) for name in names]
-    try:
-        table = np.loadtxt(io.StringIO(body), delimiter=",", usecols=places, ndmin=2)
-    except ValueError as err:
-        raise FileError(
-            f"{what} is no table: {said(err)}; write a line of names, then numbers"
-        ) from err
+    table = numbers_in(body, what, places)
     if len(table) < 2:
         raise FileError(f"{what} has {len(table)!r} lines of numbers; record more")
     return [
         np.ascontiguousarray(SIGNAL.checked_all(table[:, i], FileError, f"{what}: {name}"))
         for i, name in enumerate(names)
     ]
+
+
+def numbers_in(body: str, what: str, places: Sequence[int] | None = None) -> FloatArray:
+    """Numbers of a CSV text without its line of names, (lines, columns ``places`` or all).
+
+    Raises FileError, which calls the text ``what``, for anything but numbers.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it is empty; the caller says so
+            return np.loadtxt(io.StringIO(body), delimiter=",", usecols=places, ndmin=2)
+    except ValueError as err:
+        raise FileError(
+            f"{what} is no table: {said(err)}; write a line of names, then numbers"
+        ) from err

@@ -96,8 +96,15 @@ def through_settings(place: Path, blocks: Any) -> st.SearchStrategy[Callable[[],
 
 
 def through_csv(place: Path, blocks: Any) -> st.SearchStrategy[Callable[[], Case]]:
-    words = ("predict", "bad.csv", "--calibration", "cal.json", "--json")
-    return inputs.motion_texts().map(lambda text: lambda: Case(words, {"bad.csv": text}))
+    words = st.sampled_from([
+        ("predict", "bad.csv", "--calibration", "cal.json", "--json"),
+        ("predict", "bad.csv", "--calibration", "cal.json", "--json"),
+        ("identify", "bad.csv", "--input", "time_s", "--output", "z_m", "--period", "1e-3",
+         "--order", "2", "--out", "new.json", "--json"),
+    ])  # fmt: skip
+    return st.builds(
+        lambda words, text: lambda: Case(words, {"bad.csv": text}), words, inputs.motion_texts()
+    )
 
 
 _ON_BAGS = st.sampled_from([
