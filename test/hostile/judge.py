@@ -24,7 +24,8 @@ MOST_BYTES = 1024**3
 REMEDIES = (
     "check", "expected", "give", "use", "record", "identify", "write", "see", "call", "make",
     "move", "remove", "sample", "look", "plan", "choose", "leave", "convert", "start", "both are",
-    "are needed", "reverse", "scan at", "name columns", "at least", "more than", "set the", "needs", "must",
+    "are needed", "reverse", "scan at", "name columns", "at least", "more than", "set the", "needs",
+    "must",
 )  # fmt: skip
 
 
