@@ -25,7 +25,7 @@ from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
 from omsm_ros.storage.cloud_file import PlyWriter
 
 # No picture has so many pixels; the numbers of a summary come from all points.
-MOST_DRAWN = 1_000_000
+MOST_DRAWN = 2**19
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,15 @@ class EvenSelection:
         if len(part):
             self._parts.append(part.copy())
         while len(self) > self._most:
-            self._parts = [self.rows()[::2].copy()]
-            self._every *= 2
+            self._halve()
+
+    def _halve(self) -> None:
+        """Leave out every other row, part by part, for all at once would need them twice."""
+        before = 0
+        for place, part in enumerate(self._parts):
+            self._parts[place] = part[before % 2 :: 2].copy()
+            before += len(part)
+        self._every *= 2
 
     def rows(self) -> NDArray[Any]:
         """All rows kept so far, in order; empty before the first."""

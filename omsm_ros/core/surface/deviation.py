@@ -17,8 +17,8 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
 
 _SECTORS = 12
-# Three numbers each: 24 MB.
-_MOST_WEIGHED = 1_000_000
+# Three numbers each: 12 MB.
+_MOST_WEIGHED = 2**19
 # Beyond this a spacing is a mistaken unit, and its rings would not fit into memory.
 _MOST_STRETCHES = 1_000_000
 
@@ -120,7 +120,7 @@ class RunningStatistics:
 
     Peak to valley and rms are of all points, exact up to rounding: sums are taken about the first
     value, for a deviation is small against its stand-off. What is weighted by area is of all, or
-    of half a million and more of them, evenly chosen.
+    of a quarter of a million and more, evenly chosen.
     """
 
     def __init__(self) -> None:
