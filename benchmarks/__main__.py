@@ -17,7 +17,16 @@ from pathlib import Path
 from benchmarks.row import Row
 
 PARTS = (
-    *("identification", "free_path", "correction", "speed", "offline", "live", "real_data"),
+    *(
+        "identification",
+        "disturbed",
+        "free_path",
+        "correction",
+        "speed",
+        "offline",
+        "live",
+        "real_data",
+    ),
     "twin",
 )
 

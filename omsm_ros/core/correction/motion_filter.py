@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from omsm_ros.core.correction.uncertainty import derivative_filter, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -35,12 +36,14 @@ class MotionFilters:
     height: H on z;  dynamics: F_r on z, variance of H(z) from the covariance
     timing: on z, H(z) per unit standard uncertainty of the sideways lag
     lateral: on x, y, b, c, where the lag is latency; None where it is not
+    forgotten: samples after which the poles of G have forgotten a wrong start
     """
 
     height: DigitalFilter
     dynamics: list[DigitalFilter]
     timing: DigitalFilter | None
     lateral: DigitalFilter | None
+    forgotten: int = 2**31
 
     @classmethod
     def of(
@@ -63,12 +66,37 @@ class MotionFilters:
             dynamics=sensitivity_filters(calibration, sample_period),
             timing=timing,
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
+            forgotten=forgotten_after(g, sample_period),
         )
 
     def settling_samples(self) -> int:
         """Samples until a wrong start is forgotten to ``SETTLED`` of itself."""
-        used = [self.height] if self.lateral is None else [self.height, self.lateral]
-        return max(f.settling_samples(SETTLED) for f in used)
+        settled = self.height.settling_samples(SETTLED)
+        # A slow pole with a small share of the response is forgotten long before its decay ends.
+        settled = min(settled, self.forgotten + 2 * len(self.height.sections))
+        return max([settled, *([self.lateral.settling_samples(SETTLED)] if self.lateral else [])])
+
+
+def forgotten_after(dynamics: TransferFunction, sample_period: float) -> int:
+    """Return the samples after which G has forgotten a wrong start to ``SETTLED`` of itself.
+
+    Of a millimetre that is a nanometre, a tenth of a reading's noise. Each pole p has the share
+    N(p) / Π (1 - p/p_k) of the response; they fade as exp(p t), and the sum of all counts.
+    """
+    poles = dynamics.poles()
+    if len(poles) == 0:
+        return 0
+    apart = 1 - poles[:, np.newaxis] / poles[np.newaxis]
+    np.fill_diagonal(apart, 1.0)
+    with np.errstate(divide="ignore"):
+        share = np.abs(polynomial.polyval(poles, dynamics.numerator) / np.prod(apart, axis=1))
+    if not np.all(np.isfinite(share)):
+        return 2**31
+    # The sum of n falls below the limit at the latest where each falls below an n-th of it.
+    excess = np.log(np.maximum(len(poles) * share / SETTLED, 1.0))
+    return int(
+        np.ceil(np.max(excess / -poles.real) / sample_period + dynamics.delay / sample_period)
+    )
 
 
 class MotionFilter:

@@ -8,8 +8,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.motion_filter import MotionFilter, MotionFilters
+from omsm_ros.core.correction.motion_filter import (
+    SETTLED,
+    MotionFilter,
+    MotionFilters,
+    forgotten_after,
+)
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.accounts import Reason
 from omsm_ros.core.samples.pairing import Run
 from omsm_ros.twin.plant import Plant
@@ -126,3 +132,21 @@ def test_a_run_just_long_enough_to_start_on_is_filtered() -> None:
     assert motion.push(uniform(0, enough - 1)) == []
     assert sum(len(run) for run in motion.push(uniform(enough - 1, 1))) == enough
     assert motion.pending == 0
+
+
+def test_a_slow_pole_of_small_share_is_forgotten_before_its_decay_ends():
+    """Beside a pole of 1 ms a relaxation of 0.01 % with 2 s: its start is soon small."""
+    size, slow, fast = 1e-4, 2.0, 1e-3
+    dynamics = TransferFunction.from_ascending(
+        [1.0, slow * (1 - size)], [1.0, slow + fast, slow * fast]
+    )
+    expected = slow * np.log(2 * size / SETTLED) / 1e-3
+    assert forgotten_after(dynamics, 1e-3) == pytest.approx(expected, rel=0.01)
+    known = replace(CALIBRATION, dynamics=dynamics, covariance=np.zeros((5, 5)))
+    shares = MotionFilters.of(known, 1e-3)
+    assert shares.settling_samples() < 0.5 * shares.height.settling_samples(SETTLED)
+
+
+def test_of_fast_poles_alone_a_start_is_forgotten_as_ever():
+    filters = MotionFilters.of(CALIBRATION, 1e-3)
+    assert filters.settling_samples() <= filters.height.settling_samples(SETTLED)
