@@ -23,9 +23,9 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE))
 
-# Two at a time: nodes that talk over DDS beside what only computes, see test/conftest.py.
+# One after the other; `make test JOBS=2` on an idle machine, see test/conftest.py.
 test: lint
-	$(RUN) python -m pytest --numprocesses 2 --dist loadgroup
+	$(RUN) python -m pytest $(if $(JOBS),--numprocesses $(JOBS) --dist loadgroup)
 
 lint: setup
 	$(RUN) ruff check .
