@@ -190,3 +190,11 @@ def test_a_resonance_that_folds_to_slow_motion_is_refused() -> None:
     strong = TransferFunction(second_order(5.0, 1.0).denominator, sharp)
     with pytest.raises(DataError, match=r"0\.001 s.*off by more than 1%"):
         discretise(strong, 1e-3)
+
+
+def test_a_late_differentiator_keeps_its_gain():
+    """Without a gain at rest to hold on to, the scale comes from slow motion, delay and all."""
+    late = TransferFunction([0.0, 1.0], [1.0, 1e-2], 5.3e-3)
+    frequency = np.array([0.5, 1.0, 3.0])
+    found = discretise(late, 1e-3).response(frequency)
+    np.testing.assert_allclose(found, late.response(frequency), rtol=1e-3)
