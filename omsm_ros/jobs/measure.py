@@ -16,6 +16,7 @@ from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
+from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
@@ -79,6 +80,7 @@ def summarise(bag: Path, done: Correction, calibration: Calibration) -> dict[str
         "uncertainty_budget": done.budget,
         "stamp_skew": done.stamp_skew,
         "settings": dict(calibration.settings),
+        "latency": latency_of(calibration).entry(),
         "versions": {
             "omsm_ros": __version__,
             "python": platform.python_version(),

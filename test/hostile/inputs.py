@@ -89,7 +89,7 @@ def _change(draw: st.DrawFn, content: dict[str, Any]) -> None:
                 value[place:place] = draw(st.lists(NUMBERS, max_size=70))
     elif isinstance(value, dict) and draw(st.booleans()):
         known = sorted(value) or ["verdict"]
-        named = st.sampled_from([*known, "verdict", "reasons", "noise_m", "lag_is_latency"])
+        named = st.sampled_from([*known, "verdict", "reasons", "noise_m", "latency"])
         value[draw(named)] = draw(VALUES)
     elif draw(st.integers(0, 5)) == 0:
         del content[name]

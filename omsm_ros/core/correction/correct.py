@@ -17,6 +17,7 @@ from omsm_ros.core.correction.motion_filter import MotionFilter, MotionFilters
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
@@ -39,7 +40,7 @@ class CorrectionOptions:
     max_pending: how long a sample waits for its partner [s]; the newest block always may
     sources: other uncertainties; None takes what the calibration's certificate tells
     lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
-        None takes the calibration's lag if its settings say ``lag_is_latency``
+        None takes the latency that the calibration's certificate states
     geometry: where the probe sits and looks
     """
 
@@ -242,11 +243,9 @@ class Corrector:
 
 
 def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
-    """By how much X, Y, B and C are delayed [s]: zero unless the lag is known to be latency."""
-    if options.lateral_lag is not None:
-        return options.lateral_lag
-    stated = calibration.settings.get("lag_is_latency", False)
-    return max(calibration.dynamics.low_frequency_delay, 0.0) if stated else 0.0
+    """By how much X, Y, B and C are delayed [s]: as told, else by the latency that is known."""
+    stated = options.lateral_lag
+    return latency_of(calibration).delay_s if stated is None else stated
 
 
 def _axes_run(block: AxisBlock, arrival: Arrival) -> Run:

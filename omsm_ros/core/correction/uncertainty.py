@@ -17,6 +17,7 @@ from numpy.polynomial import polynomial
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discretise
+from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
@@ -75,12 +76,14 @@ class ErrorSources:
     def of(cls, calibration: Calibration) -> ErrorSources:
         """What the calibration's certificate tells; what it does not tell counts as zero.
 
+        But for the latency: where nothing divides the lag, any part of it may be latency.
         Its noise is that of readings at rest, so it holds the probe's resolution already.
         """
         return cls(
             probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
             static_gain=_standard_uncertainty(calibration.certificate, "static_gain_uncertainty"),
             motion_error=_standard_uncertainty(calibration.certificate, "motion_error_m"),
+            lateral_lag=latency_of(calibration).beside_z_s,
         )
 
 

@@ -98,7 +98,7 @@ class Calibration:
             raise CalibrationError(str(err)) from err
         sample_period = float(content["sample_period"])
         plausibility.check_dynamics(dynamics, sample_period)
-        plausibility.check_certificate(content["certificate"], content["settings"])
+        plausibility.check_certificate(content["certificate"])
         p = len(dynamics.numerator) + len(dynamics.denominator)
         covariance = np.asarray(content["covariance"], np.float64)
         calibration = cls(

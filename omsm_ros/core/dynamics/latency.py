@@ -8,14 +8,15 @@ scans of one part at several speeds or in both directions can.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from math import sqrt
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from omsm_ros.errors import CalibrationError, ConfigurationError, OmsmError
+from omsm_ros.quantities import LAG, SHARE, TIME_UNCERTAINTY, shown
 
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import LAG, TIME_UNCERTAINTY
+if TYPE_CHECKING:
+    from omsm_ros.core.dynamics.calibration import Calibration
 
 ENTRY = "latency"
 UNRESOLVED, REVERSAL, SPEEDS, DECLARED = "unresolved", "reversal", "several speeds", "declared"
@@ -36,6 +37,8 @@ class Latency:
     beside_z_s: standard uncertainty of the delay that the lag of Z does not share; it alone
         moves a height where Z follows the surface
     source: one of ``SOURCES``;  reason: in words
+
+    Raises ConfigurationError for values that no probe has.
     """
 
     delay_s: float
@@ -45,10 +48,38 @@ class Latency:
     source: str
     reason: str
 
+    def __post_init__(self) -> None:
+        LAG.checked(self.delay_s, ConfigurationError, "latency")
+        TIME_UNCERTAINTY.checked(self.beside_z_s, ConfigurationError, "latency beside Z")
+        if self.uncertainty_s is not None:
+            TIME_UNCERTAINTY.checked(self.uncertainty_s, ConfigurationError, "latency")
+        if self.share is not None:
+            SHARE.checked(self.share, ConfigurationError, "share of the latency")
+        if self.source not in SOURCES:
+            raise ConfigurationError(
+                f"latency by {shown(self.source)}, expected one of {', '.join(SOURCES)}"
+            )
+        if not (isinstance(self.reason, str) and self.reason.strip()):
+            raise ConfigurationError("a latency needs a reason: say where the figure comes from")
+
     @property
     def resolved(self) -> bool:
         """False if nothing tells latency from structure."""
         return self.source != UNRESOLVED
+
+    @classmethod
+    def of_entry(cls, entry: object) -> Latency:
+        """Return the inverse of :meth:`entry`; raise CalibrationError if it is none."""
+        names = {field.name for field in fields(cls)}
+        if not isinstance(entry, Mapping) or set(entry) != names:
+            raise CalibrationError(
+                f"certificate: latency is {shown(entry)}, expected {', '.join(sorted(names))}; "
+                "declare it again with 'omsm latency'"
+            )
+        try:
+            return cls(**entry)
+        except OmsmError as err:
+            raise CalibrationError(f"certificate: {err}") from err
 
     def entry(self) -> dict[str, Any]:
         """For ``certificate["latency"]``: JSON values."""
@@ -57,15 +88,9 @@ class Latency:
 
 def latency_of(calibration: Calibration) -> Latency:
     """Return what ``calibration`` says of its latency; unresolved if it says nothing."""
-    entry = calibration.certificate.get(ENTRY)
-    if isinstance(entry, Mapping):
-        return Latency(**entry)
-    lag = calibration.dynamics.low_frequency_delay
-    if calibration.settings.get("lag_is_latency", False):
-        # Calibrations of before 0.2 had this setting in place of the entry.
-        spread = calibration.low_frequency_delay_uncertainty
-        return declared(lag, lag, spread, "setting lag_is_latency")
-    return unresolved(lag)
+    if ENTRY in calibration.certificate:
+        return Latency.of_entry(calibration.certificate[ENTRY])
+    return unresolved(calibration.dynamics.low_frequency_delay)
 
 
 def unresolved(lag: float) -> Latency:
@@ -74,10 +99,11 @@ def unresolved(lag: float) -> Latency:
     X and C are not delayed, for nothing says that they should be. The true delay lies anywhere
     between 0 and the lag, uniformly: its rms from zero is lag/√3.
     """
+    spread = abs(lag) / sqrt(3.0)
     return Latency(
         delay_s=0.0,
-        uncertainty_s=abs(lag) / np.sqrt(3.0),
-        beside_z_s=abs(lag) / np.sqrt(3.0),
+        uncertainty_s=spread,
+        beside_z_s=spread,
         share=None,
         source=UNRESOLVED,
         reason="a step test alone cannot tell latency of the probe from lag of the structure",
@@ -89,12 +115,6 @@ def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Laten
 
     Raises ConfigurationError for a delay or uncertainty that no probe has, or without a reason.
     """
-    LAG.checked(delay, ConfigurationError, "latency")
-    TIME_UNCERTAINTY.checked(uncertainty, ConfigurationError, "uncertainty of the latency")
-    if not reason.strip():
-        raise ConfigurationError(
-            "a declared latency needs a reason: say where the figure comes from"
-        )
     return Latency(
         delay_s=delay,
         uncertainty_s=uncertainty,

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from omsm_ros.core.dynamics.latency import ENTRY, Latency
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
@@ -75,8 +76,8 @@ def check_covariance(covariance: FloatArray, dynamics: TransferFunction, trusted
     _check_size(deviation, dynamics, trusted)
 
 
-def check_certificate(certificate: Mapping[str, object], settings: Mapping[str, object]) -> None:
-    """Raise CalibrationError for a verdict or a setting that others would take for another."""
+def check_certificate(certificate: Mapping[str, object]) -> None:
+    """Raise CalibrationError for a verdict or a latency that others would take for another."""
     verdict = certificate.get("verdict", "")
     if not isinstance(verdict, str):
         raise CalibrationError(
@@ -89,11 +90,8 @@ def check_certificate(certificate: Mapping[str, object], settings: Mapping[str, 
             raise CalibrationError(
                 f"certificate: {name} is {shown(texts)}, expected a list of texts; identify again"
             )
-    stated = settings.get("lag_is_latency", False)
-    if not isinstance(stated, bool):
-        raise CalibrationError(
-            f"settings: lag_is_latency is {shown(stated)}, expected true or false"
-        )
+    if ENTRY in certificate:
+        Latency.of_entry(certificate[ENTRY])
 
 
 def _inverse(rate: float) -> float:

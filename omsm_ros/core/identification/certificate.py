@@ -8,6 +8,7 @@ from itertools import chain
 
 import numpy as np
 
+from omsm_ros.core.dynamics.latency import ENTRY, unresolved
 from omsm_ros.core.dynamics.masses_and_springs import finite_values, shape
 from omsm_ros.core.dynamics.modes import modal_remainder, mode_entries
 from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
@@ -102,6 +103,7 @@ def _residual_entries(evidence: Evidence) -> dict[str, object]:
 def _response_entries(evidence: Evidence) -> dict[str, object]:
     dynamics, known = evidence.dynamics, evidence.known
     return {
+        ENTRY: unresolved(dynamics.low_frequency_delay).entry(),
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": low_frequency_delay_uncertainty(
             dynamics, known.covariance

@@ -10,6 +10,7 @@ import jinja2
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.samples.blocks import FloatArray
@@ -20,7 +21,13 @@ from omsm_ros.report.certificate import tables as tables
 from omsm_ros.report.common import style
 from omsm_ros.report.common.measured import measured, number, plain
 from omsm_ros.report.common.response_figures import step_response
-from omsm_ros.report.common.tables import NOTHING, Table, mapping_table, quantity
+from omsm_ros.report.common.tables import (
+    NOTHING,
+    Table,
+    latency_text,
+    mapping_table,
+    quantity,
+)
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.measurement.page import Headline
 from omsm_ros.units import DEGREE_RAD, PPM
@@ -179,6 +186,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
     spread = number(certificate.get("static_gain_uncertainty"))
     return [
         Headline("Low-frequency delay", delay, _k1(delay, "how late slow motion is seen")),
+        Headline("Of it latency", latency_text(calibration), latency_of(calibration).reason),
         _gain_headline(calibration.static_gain, spread),
         _range_headline(calibration),
         Headline(

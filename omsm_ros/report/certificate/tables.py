@@ -28,7 +28,7 @@ _SHOWN = {
     "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
     "valid_from", "departures", "could_hide", "assumed", "motion_error_m", "reservations",
     "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
-    "reference_lag_uncertainty_s",
+    "reference_lag_uncertainty_s", "latency",
 }  # fmt: skip
 
 CertificateEntries = Mapping[str, Any]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.latency import latency_of
 
 NOTHING = "–"
 # Nothing smaller than nano: lengths below it are read as 0.31 nm.
@@ -122,6 +123,14 @@ def sample_table(summary: Mapping[str, object]) -> Table:
     return Table("Samples", tuple(streams), rows if streams else ())
 
 
+def latency_text(calibration: Calibration) -> str:
+    """How much of the lag is latency, and who says so."""
+    latency = latency_of(calibration)
+    if latency.share is None:
+        return f"not known ({latency.source})"
+    return f"{_seconds(latency.delay_s, latency.uncertainty_s)} ({latency.source})"
+
+
 def calibration_table(calibration: Calibration) -> Table:
     """What was identified and how well."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
@@ -135,6 +144,7 @@ def calibration_table(calibration: Calibration) -> Table:
         ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
         ("static gain, probe per encoder", gain),
         ("delay of slow motion", delay),
+        ("of it latency of the probe", latency_text(calibration)),
         ("chi-square per degree of freedom", _plain(certificate.get("chi_square"))),
         ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
         ("whiteness of the residual, p", _plain(certificate.get("whiteness_p"))),

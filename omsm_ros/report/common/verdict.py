@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.latency import REMEDY, latency_of
 from omsm_ros.report.common.tables import count, part
+from omsm_ros.units import MICROSECOND_S
 
 # A map with more holes than this hides something.
 _LEAST_SHARE_CORRECTED = 0.95
@@ -37,7 +39,7 @@ def verdict_on_measurement(
         against += ["the calibration was rejected", *map(str, certificate.get("reasons") or ())]
     if against:
         return Verdict("bad", "Not to be trusted", tuple(against))
-    doubts = [*map(str, part(summary, "warnings") or ()), *_losses(summary)]
+    doubts = [*map(str, part(summary, "warnings") or ()), *_losses(summary), *_latency(calibration)]
     if not stated:
         missing = "the calibration has no certificate" if calibration else "no calibration is given"
         return Verdict("unknown", "Not judged", (missing, *doubts))
@@ -57,6 +59,17 @@ def _accounting(summary: Mapping[str, object]) -> list[str]:
         if seen != stream["received"]:
             found.append(f"{name}: {count(abs(stream['received'] - seen))} samples unaccounted for")
     return found
+
+
+def _latency(calibration: Calibration | None) -> list[str]:
+    """What to do about a lag of which nobody knows whether X and C share it."""
+    if calibration is None or latency_of(calibration).resolved:
+        return []
+    lag = calibration.dynamics.low_frequency_delay
+    return [
+        f"of the lag of {lag / MICROSECOND_S:.1f} µs any part may be latency of the probe, by "
+        f"which X and C would have to be delayed (lateral_lag in the budget): {REMEDY}"
+    ]
 
 
 def _losses(summary: Mapping[str, object]) -> list[str]:

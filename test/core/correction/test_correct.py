@@ -15,6 +15,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, later
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.latency import declared, with_latency
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.accounts import Account, StreamAccount
@@ -476,9 +477,9 @@ def test_stated_noise_is_the_scatter_of_the_heights(scan: Recording) -> None:
 
 def test_latency_is_assumed_only_where_it_is_known() -> None:
     lag = CALIBRATION.dynamics.low_frequency_delay
-    late = calibration(settings={"lag_is_latency": True})
+    late = with_latency(CALIBRATION, declared(lag, 0.7 * lag, 1e-6, "data sheet"))
     assert lateral_lag(CALIBRATION, CorrectionOptions()) == 0.0
-    assert lateral_lag(late, CorrectionOptions()) == pytest.approx(lag)
+    assert lateral_lag(late, CorrectionOptions()) == 0.7 * lag
     assert lateral_lag(late, CorrectionOptions(lateral_lag=0.0)) == 0.0
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.latency import latency_of, unresolved
 from omsm_ros.core.dynamics.plausibility import MAX_TIME_CONSTANT_SAMPLES
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
@@ -121,6 +122,27 @@ def test_reasons_that_are_no_texts_are_refused(texts: object) -> None:
         changed(certificate={"reasons": texts})
 
 
-def test_a_latency_that_is_neither_true_nor_false_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="lag_is_latency is 'no'"):
-        changed(settings={"lag_is_latency": "no"})
+GOOD_LATENCY = unresolved(1e-4).entry()
+
+
+@pytest.mark.parametrize(
+    ("entry", "named"),
+    [
+        ("late", "latency is 'late'"),
+        ({"delay_s": 1e-4}, "beside_z_s, delay_s"),
+        (GOOD_LATENCY | {"delay_s": -1e-3}, "latency is -0.001 s"),
+        (GOOD_LATENCY | {"uncertainty_s": "none"}, "latency is 'none' s"),
+        (GOOD_LATENCY | {"beside_z_s": None}, "latency beside Z is None s"),
+        (GOOD_LATENCY | {"source": "hearsay"}, "latency by 'hearsay'"),
+        (GOOD_LATENCY | {"reason": " "}, "needs a reason"),
+        (GOOD_LATENCY | {"share": "half"}, "share of the latency is 'half'"),
+    ],
+)
+def test_a_latency_that_no_probe_has_is_refused(entry: object, named: str) -> None:
+    with pytest.raises(CalibrationError, match=named):
+        changed(certificate={"latency": entry})
+
+
+def test_a_latency_comes_back_as_it_was() -> None:
+    found = latency_of(changed(certificate={"latency": GOOD_LATENCY}))
+    assert found.entry() == GOOD_LATENCY

@@ -71,3 +71,13 @@ def test_the_worst_decides(summary, certified):
 
 def test_nothing_at_all_is_not_judged():
     assert verdict_on_measurement({}, None).level == "unknown"
+
+
+def test_a_lag_that_nothing_divides_is_a_reservation_with_its_remedy(summary, certified):
+    unresolved = {"verdict": "accepted"}
+    verdict = verdict_on_measurement(summary, replace(certified, certificate=unresolved))
+    assert verdict.level == "care"
+    (reason,) = verdict.reasons
+    assert "339.7 µs" in reason
+    assert "omsm selfcal" in reason
+    assert "omsm reversal" in reason

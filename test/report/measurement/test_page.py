@@ -131,7 +131,8 @@ def test_settings_that_are_those_of_the_calibration_are_said_once(summary, certi
     [({"verdict": "accepted"}, "✓ Trusted"), ({"verdict": "rejected"}, "✕ Not to be trusted")],
 )
 def test_the_verdict_is_a_sign_and_a_word_before_all_else(summary, certified, certificate, word):
-    page = Page(render(Report("a", "b", summary, replace(certified, certificate=certificate))))
+    stated = {**certified.certificate, **certificate}
+    page = Page(render(Report("a", "b", summary, replace(certified, certificate=stated))))
     text = " ".join(" ".join(page.text).split())
     assert word in text
     assert text.index(word) < text.index("Errors")
