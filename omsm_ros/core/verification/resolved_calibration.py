@@ -28,8 +28,8 @@ SCOPE = (
     "identified on a surface that Z follows, where latency leaves no trace: the response is that "
     "of the structure, for surfaces followed as closely; a step test besides tells the latency"
 )
-# One clean run in ten thousand.
-_SURPRISE_P = 1e-4
+# One clean run in a thousand.
+_SURPRISE_P, _SURPRISE_SIGMAS = 1e-3, 3.0
 # A spindle keeps its speed to better than that.
 _SAME_SPEED = 0.01
 # The low-order model's own poles, well above what moved and well below Nyquist.
@@ -252,6 +252,14 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
             f"scans and step test contradict each other: the lag would have to change by "
             f"{shift:.2f} µs, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
             "repeat the step test with the settings of the scans"
+        )
+    latency, spread = (
+        float(v) for v in (found.values[LATENCY], found.covariance[LATENCY, LATENCY])
+    )
+    if latency < -_SURPRISE_SIGMAS * np.sqrt(spread):
+        reasons.append(
+            f"the probe would have to be {-latency / MICROSECOND_S:.1f} µs early: the structure "
+            "lags more in the scans than in the step test; repeat the step test"
         )
     if not reasons:
         return certificate

@@ -10,7 +10,6 @@ import jinja2
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
-from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.samples.blocks import FloatArray
@@ -186,7 +185,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
     spread = number(certificate.get("static_gain_uncertainty"))
     return [
         Headline("Low-frequency delay", delay, _k1(delay, "how late slow motion is seen")),
-        Headline("Of it latency", latency_text(calibration), latency_of(calibration).reason),
+        Headline("Of it latency", latency_text(calibration), "by which X and C are delayed"),
         _gain_headline(calibration.static_gain, spread),
         _range_headline(calibration),
         Headline(

@@ -10,6 +10,7 @@ from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
+from omsm_ros.errors import CalibrationError
 
 NOTHING = "–"
 # Nothing smaller than nano: lengths below it are read as 0.31 nm.
@@ -125,7 +126,10 @@ def sample_table(summary: Mapping[str, object]) -> Table:
 
 def latency_text(calibration: Calibration) -> str:
     """How much of the lag is latency, and who says so."""
-    latency = latency_of(calibration)
+    try:
+        latency = latency_of(calibration)
+    except CalibrationError:
+        return NOTHING
     if latency.share is None:
         return f"not known ({latency.source})"
     return f"{_seconds(latency.delay_s, latency.uncertainty_s)} ({latency.source})"

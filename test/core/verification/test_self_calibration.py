@@ -194,16 +194,22 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
 
 
 def test_a_step_test_that_the_scans_contradict_is_told() -> None:
-    # The probe is prompt; the step test was made with a slower structure.
-    slow = step_test(0.0, off=100e-6)
+    # The probe is prompt; the step test was made with a slower structure. What it has too much
+    # passes for latency, but for the following error, which shows that it is none.
+    slow = step_test(0.0, off=300e-6)
     pair = [scanned(made(rpm, s, disturbed()), slow) for s, rpm in ((1, 30.0), (2, 60.0))]
     found = self_calibrate(pair, after_step_test(slow))
-    # What the step test has too much passes for a latency of less than nothing, and the
-    # following error shows that it is none.
-    assert found.surprise > 20
     result = resolved(slow, found)
     assert result.certificate["verdict"] == "rejected"
     assert "scans and step test contradict each other" in str(result.certificate["reasons"])
+
+
+def test_a_probe_that_would_be_early_is_told() -> None:
+    stiff = step_test(0.0, off=-30e-6)
+    pair = [scanned(made(rpm, s, disturbed()), stiff) for s, rpm in ((1, 30.0), (2, 60.0))]
+    result = resolved(stiff, self_calibrate(pair, after_step_test(stiff)))
+    assert result.certificate["verdict"] == "rejected"
+    assert "µs early" in str(result.certificate["reasons"])
 
 
 def test_one_speed_and_direction_tell_nothing() -> None:
@@ -214,9 +220,9 @@ def test_one_speed_and_direction_tell_nothing() -> None:
 
 
 def test_a_part_mounted_anew_tells_nothing() -> None:
-    known = step_test(0.0)
-    pair = [scanned(made(rpm, s, disturbed()), known) for s, rpm in ((1, 30.0), (2, 60.0))]
-    unknown = replace(after_step_test(known), clocking=10.0)
+    plain = unit_calibration(1e-3, TRUE_GAIN)
+    pair = [scanned(made(rpm, s, disturbed()), plain) for s, rpm in ((1, 30.0), (2, 60.0))]
+    unknown = replace(without_step_test(), clocking=10.0)
     with pytest.raises(DataError, match="without taking it off"):
         self_calibrate(pair, unknown)
 

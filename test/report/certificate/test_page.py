@@ -187,7 +187,8 @@ class TestOlderCertificates:
         titles = [section.title for section in sections(bare(older))]
         assert titles == ["Dynamics", "Static gain and background", "Records"]
         assert set(by_name(older)) == {
-            "Low-frequency delay", "Static gain, probe per encoder", "Valid up to", "Structure",
+            "Low-frequency delay", "Of it latency", "Static gain, probe per encoder", "Valid up to",
+            "Structure",
         }  # fmt: skip
 
     def test_each_entry_may_be_missing_or_of_another_kind(self, calibration):
