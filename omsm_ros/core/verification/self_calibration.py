@@ -16,8 +16,9 @@ import numpy as np
 from scipy import linalg
 
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.verification.eliminated_surface import Portion, normal_equations
-from omsm_ros.core.verification.scan_agreement import Agreement, AgreementSums
+from omsm_ros.core.verification.eliminated_surface import normal_equations
+from omsm_ros.core.verification.ring_scores import RingScores
+from omsm_ros.core.verification.scan_agreement import Agreement
 from omsm_ros.core.verification.scan_model import (
     CLOCKING,
     CURVATURE,
@@ -55,7 +56,6 @@ _ITERATIONS = 6
 _CONVERGED_S = 1e-8
 # They tell a lag to a microsecond, and what a step leaves is of second order in that.
 _ENOUGH_POINTS = 40_000
-_MOST_RINGS, _LEAST_RINGS = 60, 12
 # What the scans narrow to less than this part of what was assumed is known from them.
 _KNOWN = 0.01
 # Worse than this, 40 nm on the paper's scan, it rests on terms that are not modelled.
@@ -220,7 +220,7 @@ class _Fit:
         """Residuals, covariance by rings, and what is said of the scans."""
         self._step(every=1)
         model, parameters = self._model, self._parameters
-        seen = _Seen(model, self._equations.shares)
+        seen = RingScores(model, self._equations.shares)
         assert self._surface is not None
         for part in model.portions(self._place, 1):
             seen.add(
@@ -262,56 +262,6 @@ class _Fit:
         change = -inverse @ self._equations.matrix[:, GAIN] / self._variance
         change[GAIN] = 1.0
         return np.asarray(np.outer(change, change) * self._prior.covariance[GAIN, GAIN])
-
-
-class _Seen:
-    """Gathers, at the end of the fit, what the residuals tell."""
-
-    def __init__(self, model: ScanModel, shares: FloatArray) -> None:
-        self._model, self._shares = model, shares
-        rings = int(np.clip(min(model.turns), _LEAST_RINGS, _MOST_RINGS))
-        self._scores = np.zeros((rings, model.size))
-        self._second = np.zeros((DYNAMIC, DYNAMIC))
-        self.square = 0.0
-        basis = model.basis
-        self.agreement = AgreementSums(model.number, basis.inner, basis.outer)
-
-    def add(
-        self,
-        part: Portion,
-        x: FloatArray,
-        y: FloatArray,
-        parameters: FloatArray,
-        surface: FloatArray,
-    ) -> None:
-        model, basis = self._model, self._model.basis
-        terms, here = part.rows.matrix(), basis.terms(part.interval)
-        residual = y - x @ parameters - terms @ surface[here]
-        free = x - terms @ self._shares[here]
-        radius, angle = model.radius(part), model.angle(part)
-        depth = (radius - basis.inner) / (basis.outer - basis.inner)
-        ring = np.clip(depth * len(self._scores), 0, len(self._scores) - 1).astype(np.int64)
-        for number in np.unique(ring):
-            mine = ring == number
-            self._scores[number] += residual[mine] @ free[mine]
-        four = x[:, :DYNAMIC].copy()
-        four[:, GAIN] += terms @ surface[here]
-        self._second += four.T @ four
-        self.square += float(residual @ residual)
-        scan = model.scan[part.points]
-        for k in np.unique(scan):
-            mine = scan == k
-            self.agreement.add(int(k), radius[mine], angle[mine], residual[mine])
-
-    def meat(self) -> FloatArray:
-        """Covariance of the scores, (parameters, parameters); a ring varies as a whole."""
-        rings = len(self._scores)
-        return np.asarray(self._scores.T @ self._scores * (rings / (rings - 1)))
-
-    def followed(self, covariance: FloatArray) -> float:
-        """Standard uncertainty of the heights by the four parameters, rms over all points [m]."""
-        mean_square = float(np.sum(self._second * covariance)) / len(self._model)
-        return float(np.sqrt(max(mean_square, 0.0)))
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
