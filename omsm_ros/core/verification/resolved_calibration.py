@@ -105,19 +105,20 @@ def from_scans_alone(
 ) -> Calibration:
     """Return a calibration of low order from scans corrected with :func:`unit_calibration`.
 
-    ``N/D e^{-τs}`` with D a fast double pole and N such that the lag and the curvature are
-    those found.
+    ``N/D e^{-τs}`` with two fast poles, an octave apart, and N such that the lag and the curvature
+    are those found.
     """
     latency = max(float(found.values[LATENCY]), 0.0)
     total, curvature = float(found.values[LAG]), float(found.values[CURVATURE])
     lag = total - latency
     curvature += latency**2 / 2 - total * latency
     slow = sample_period / (2 * np.pi * _POLE_SHARE_OF_RATE)
-    denominator = np.array([1.0, 2 * slow, slow**2])
-    numerator = np.array([1.0, 2 * slow - lag, slow**2 - 2 * slow * lag + curvature])
+    first, second = 1.5 * slow, 0.5 * slow**2
+    denominator = np.array([1.0, first, second])
+    numerator = np.array([1.0, first - lag, second - first * lag + curvature])
     by_found = np.zeros((6, DYNAMIC))
     by_found[1] = [-1, 0, 0, 1]
-    by_found[2] = [-2 * slow - latency, 1, 0, 2 * slow + latency - total]
+    by_found[2] = [-first - latency, 1, 0, first + latency - total]
     by_found[5, LATENCY] = 1.0
     dynamics = TransferFunction(numerator, denominator, latency)
     trusted = min(_highest_excited(found), 0.5 / sample_period)
