@@ -1,12 +1,10 @@
 """How many poles, zeros, and whether a delay: what the data insist on, and one more.
 
-Three votes. The singular values of a block-Hankel matrix (Verhaegen and Dewilde 1992) say
-how many states stand out of the noise, and bound the search. The Bayesian information
-criterion finds the smallest structure the data insist on. Held-out edges may veto it.
-
-The smallest such structure still leaves a bias of about one standard deviation, which no
-covariance shows. The chosen one is therefore the best with one parameter more: variance,
-which the band states, is preferred to bias, which nobody sees.
+The Bayesian information criterion finds the smallest structure the data insist on. That still
+leaves a bias of about one standard deviation, which no covariance shows. The chosen one is
+therefore the best with one parameter more: variance, which the band states, is preferred to
+bias, which nobody sees. What else was tried, and changed nothing, is in
+``docs/design/identification-ablation.md``.
 """
 
 from __future__ import annotations
@@ -22,10 +20,12 @@ from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.samples.blocks import BoolArray
 from omsm_ros.errors import IdentificationError
 
-MAX_POLES = 8
+# Without asking; real machines in the band of a step test have needed four.
+_FREE_POLES = 8
+# With asking: beyond, the coefficients of a polynomial lose their digits.
+MAX_POLES = 20
+# A lag and its roll-off: with fewer, the band is three times too narrow on a pure delay.
 _LEAST_PARAMETERS = 3
-# Held-out rms, relative: far above its scatter over a few thousand samples.
-_CLEARLY_WORSE = 1.05
 # Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
 _CANCELLING = 0.005
 
@@ -44,11 +44,10 @@ def structures(poles: int) -> list[Structure]:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A fit with its scores: BIC (lower is better), held-out rms [m] or NaN where not tried."""
+    """A fit with its BIC; lower is better."""
 
     fit: Fit
     bic: float
-    held_out: float = float("nan")
 
 
 def information(fit: Fit, colour: float = 1.0) -> float:
@@ -64,30 +63,28 @@ def information(fit: Fit, colour: float = 1.0) -> float:
 
 def explore(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
-    at_least: int,
-    forced: int,
+    order: int = 0,
     colour: float = 1.0,
 ) -> list[Candidate]:
     """Fit structure after structure; stop when two more poles in a row gain nothing.
 
-    at_least: number of poles to go to in any case;  forced: only this many, if not 0
-    colour: of the noise, see :func:`information`
+    order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
 
-    Raises IdentificationError for a forced order that is no number of poles to try.
+    Raises IdentificationError for an order that is no number of poles to try.
     """
-    if not 0 <= forced <= MAX_POLES:
-        raise IdentificationError(f"order {forced!r}, expected 0 (choose) to {MAX_POLES}")
+    if not 0 <= order <= MAX_POLES:
+        raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_POLES}")
     found: list[Candidate] = []
     fruitless = 0
-    for poles in range(forced + 1) if forced else range(MAX_POLES + 1):
+    for poles in range(max(_FREE_POLES, order) + 1):
         before = min((c.bic for c in found), default=np.inf)
         for structure in _promising(poles, found, fit_structure, colour):
             fitted = fit_structure(structure, [c.fit for c in found])
             found.append(Candidate(fitted, information(fitted, colour)))
         fruitless = 0 if min(c.bic for c in found) < before else fruitless + 1
-        if not forced and fruitless >= 2 and poles > at_least:
+        if fruitless >= 2 and poles >= order:
             break
-    return [c for c in found if not forced or c.fit.structure.poles == forced]
+    return found
 
 
 def _promising(
@@ -111,16 +108,11 @@ def _promising(
     return [s for s in every[:-1] if s.size < largest.structure.size + spare]
 
 
-def choose(
-    candidates: Sequence[Candidate], held_out: Callable[[Fit], float]
-) -> tuple[Candidate, list[Candidate]]:
-    """The best by BIC, enriched: the best of those that contain it with one parameter more.
+def choose(candidates: Sequence[Candidate]) -> Candidate:
+    """Return the best by BIC, enriched: the best that contains it with one parameter more.
 
     With fewer than three parameters, lag and roll-off could not both bend over the band.
-    One whose zero cancels a pole is no richer. The enriched one is vetoed where it is
-    clearly worse on edges it has not seen.
-
-    held_out: rms [m] of a structure, fitted without the held-out edges, on them
+    One whose zero cancels a pole is no richer.
     """
     smallest = min(candidates, key=lambda c: c.bic)
     wanted = max(smallest.fit.structure.size + 1, _LEAST_PARAMETERS)
@@ -131,14 +123,7 @@ def choose(
         and c.fit.structure.size >= wanted
         and not cancels(c.fit.dynamics)
     ]
-    enriched = min(
-        richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest
-    )
-    scored = {c: replace(c, held_out=held_out(c.fit)) for c in {smallest, enriched}}
-    chosen = scored[enriched]
-    if chosen.held_out > _CLEARLY_WORSE * scored[smallest].held_out:
-        chosen = scored[smallest]
-    return chosen, [scored.get(c, c) for c in candidates]
+    return min(richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest)
 
 
 def cancels(dynamics: TransferFunction) -> bool:

@@ -1,8 +1,7 @@
 """Where a fit starts: several places, because the output error has local minima.
 
 From the best fit of a smaller structure, so that richer never fits worse; from iterated linear
-least squares and from the subspace method, which find a resonance no guess would; and
-from a plain guess.
+least squares, which finds a resonance that no guess would; and from a plain guess.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roots
 from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -34,12 +32,11 @@ _ADDED_POLE = -10.0
 class StartingPoints:
     """Propose nonlinear parameters ψ for the structures of one problem.
 
-    pure_delay: the fit of a delay alone;  estimate: of the order
+    pure_delay: the fit of a delay alone
     """
 
     problem: Problem
     pure_delay: Fit
-    vote: OrderEstimate
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
         """Return ψ of ``structure``, given the fits made so far."""
@@ -49,9 +46,6 @@ class StartingPoints:
             return [self.pure_delay.nonlinear]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
         found = [_guess(scaled, kept), scaled.nonlinear_of(self._linear(structure, kept), kept)]
-        subspace = _stable(self.vote.poles / self.problem.rate)
-        if len(subspace) == structure.poles:
-            found.append(scaled.nonlinear_of(subspace, kept))
         contained = [f for f in smaller if structure.contains(f.structure)]
         if contained:
             found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))

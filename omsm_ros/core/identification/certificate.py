@@ -70,11 +70,8 @@ def _order_entries(model: Model) -> dict[str, object]:
     return {
         "order": model.chosen.fit.structure.poles,
         "structure": _structure(model.chosen),
-        "singular_values": [float(v) for v in model.vote.singular_values],
-        "singular_value_order": model.vote.order,
         "candidates": [
-            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms, "held_out_m": _number(c.held_out)}
-            for c in model.candidates
+            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms} for c in model.candidates
         ],
     }
 
@@ -82,10 +79,6 @@ def _order_entries(model: Model) -> dict[str, object]:
 def _structure(candidate: Candidate) -> dict[str, object]:
     structure = candidate.fit.structure
     return {"poles": structure.poles, "zeros": structure.zeros, "delay": structure.delay}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _residual_entries(evidence: Evidence) -> dict[str, object]:

@@ -28,7 +28,7 @@ from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.hidden_terms import hidden_covariance
-from omsm_ros.core.identification.model_choice import choose_model, model_from_start
+from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.identification.two_masses import table_mass
 from omsm_ros.core.samples.motion_record import MotionRecord
@@ -86,8 +86,8 @@ def identify(
     hidden = hidden_covariance(searched.survey, settings or {}, limits)
     hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
     known = response_uncertainty(prepared, model, limits, hidden)
-    if order:
-        known = no_surer(known, prepared, model, choose_model(prepared), limits)
+    if model.free is not None:
+        known = no_surer(known, prepared, model, model.free, limits)
     evidence = Evidence(record, prepared, model, known, limits, searched, noise)
     findings = [*known.findings, *(check(evidence) for check in CHECKS)]
     best = model.chosen.fit

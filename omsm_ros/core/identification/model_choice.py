@@ -9,41 +9,43 @@ import numpy as np
 
 from omsm_ros.core.fitting.initial_condition import starts_ringing
 from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_choice import Candidate, choose, explore, held_out_rms
-from omsm_ros.core.fitting.order_estimate import OrderEstimate, estimate_order
+from omsm_ros.core.fitting.order_choice import Candidate, choose, explore
 from omsm_ros.core.fitting.output_error import Fit, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.fitting.starting_points import StartingPoints
-from omsm_ros.core.fitting.steps import held_out
 from omsm_ros.core.identification.residual_tests import noise_colour
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The chosen candidate among those tried, and the vote of the singular values."""
+    """The chosen candidate among those of its kind that were tried.
+
+    free: the choice without asking, where an order was asked for; else None
+    """
 
     chosen: Candidate
     candidates: Sequence[Candidate]
-    vote: OrderEstimate
+    free: Model | None = None
 
 
 def choose_model(prepared: Prepared, order: int = 0) -> Model:
-    """Fit structures to the prepared problem and choose among them; ``order`` poles, or 0."""
+    """Fit structures to the prepared problem and choose among them; ``order`` poles, or 0.
+
+    The free choice is made in any case; an order that is asked for is picked beside it.
+    """
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    static = lag.gain * problem.input + problem.background @ lag.background
-    deviation = (problem.output - static) / lag.gain
-    vote = estimate_order(problem.input, deviation, problem.used, problem.period)
-    points = StartingPoints(problem, lag, vote)
+    points = StartingPoints(problem, lag)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
-    colour = noise_colour(problem, lag, prepared.steps)
-    candidates = explore(fit_structure, vote.order, order, colour)
-    held = held_out(prepared.steps, len(problem.input))
-    chosen, candidates = choose(candidates, lambda f: held_out_rms(problem, f, held))
-    return Model(chosen, candidates, vote)
+    candidates = explore(fit_structure, order, noise_colour(problem, lag, prepared.steps))
+    free = Model(choose(candidates), candidates)
+    if not order:
+        return free
+    asked = [c for c in candidates if c.fit.structure.poles == order]
+    return Model(choose(asked), asked, free)
 
 
 def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, Model]:

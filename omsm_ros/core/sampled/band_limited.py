@@ -12,7 +12,7 @@ from omsm_ros.core.fitting.order_choice import held_out_rms
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.preparation import Prepared, content_frequency, from_rest_to_rest
 from omsm_ros.core.fitting.steps import LEAST_SAMPLES, Steps, held_out, sample_noise
-from omsm_ros.core.identification.model_choice import choose_model, model_from_start
+from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
@@ -40,8 +40,8 @@ def band_limited(
     """
     prepared, model = model_from_start(_prepared(input, output, used), order)
     known = response_uncertainty(prepared, model, limits)
-    free = choose_model(prepared) if order else model
-    if order:
+    free = model.free or model
+    if model.free is not None:
         known = no_surer(known, prepared, model, free, limits)
     best, problem, slower = model.chosen.fit, prepared.problem, period / _NOMINAL_PERIOD_S
     lines = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / problem.period

@@ -31,7 +31,6 @@ _COHERENT = 0.5
 # Points on a logarithmic axis: more than these a decade would be a smear.
 _POINTS_PER_DECADE = 12
 _LAGS = 25
-_LEAST_SINGULAR = 1e-3
 _LIMIT: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": (0, (4, 2))}
 _SPAN: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
 _BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
@@ -150,40 +149,14 @@ def _draw_correlation(axes: Axes, left: FloatArray) -> None:
     style.label(axes, x="lag [samples]", y="correlation [1]", title="Its autocorrelation")
 
 
-def order(
-    singular_values: Sequence[float],
-    candidates: Sequence[Mapping[str, float]],
-    chosen: int | None,
-) -> Figure:
-    """The votes on the order: singular values beside their noise, and what each candidate leaves.
+def order(candidates: Sequence[Mapping[str, float]], chosen: int | None) -> Figure:
+    """What each candidate leaves, over its number of parameters.
 
-    singular_values: in units of the largest that noise would give;  may be empty
     candidates: ``parameters``, ``rms_m`` and ``bic`` of each;  chosen: index of one of them
     """
-    shown = [bool(len(singular_values)), bool(candidates)]
-    made, axes = style.figure(12.4, 2.7, columns=max(sum(shown), 1))
-    places = iter(axes[0])
-    if shown[0]:
-        _draw_singular_values(next(places), np.asarray(singular_values, np.float64))
-    if shown[1]:
-        _draw_candidates(next(places), candidates, chosen)
+    made, axes = style.figure(6.1, 2.7)
+    _draw_candidates(axes[0, 0], candidates, chosen)
     return made
-
-
-def _draw_singular_values(axes: Axes, values: FloatArray) -> None:
-    index = np.arange(1, len(values) + 1)
-    out = values > 1
-    _plain_log(axes)
-    # A decade at least, and a value of zero at its foot.
-    low, high = min(0.1, float(np.min(values)) / 1.5), max(10.0, 1.5 * float(np.max(values)))
-    axes.set_ylim(max(low, _LEAST_SINGULAR), high)
-    axes.axhline(1.0, label="limit of noise", **_LIMIT)
-    for inside, colour, text in ((out, style.AFTER, "state"), (~out, style.MUTED, "noise")):
-        if np.any(inside):
-            axes.plot(index[inside], values[inside], "o", color=colour, markersize=5, label=text)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    style.legend_above(axes)
-    style.label(axes, x="number", y="over the limit [1]", title="Singular values")
 
 
 def _draw_candidates(

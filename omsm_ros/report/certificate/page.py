@@ -42,10 +42,7 @@ CAPTIONS = {
         "What the model leaves over the whole recording, at the edges on top of each other "
         "(downward ones turned over), and from sample to sample."
     ),
-    "order": (
-        "Singular values above the limit are states that stand out of the noise. "
-        "Each candidate is a structure that was fitted to the same samples."
-    ),
+    "order": ("Each candidate is a structure that was fitted to the same samples."),
 }
 
 
@@ -94,11 +91,10 @@ def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> di
         "residual": certificate_figures.residual(fitted, number(certificate.get("noise_m"))),
     }
     candidates = [c for c in tables.listed(certificate, "candidates") if _comparable(c)]
-    values = tables.numbers(certificate, "singular_values")
-    if values or candidates:
+    if candidates:
         chosen = [i for i, c in enumerate(candidates) if tables.is_chosen(c, certificate)]
         sized = [{**c, "parameters": c["poles"] + c["zeros"] + c["delay"]} for c in candidates]
-        made["order"] = certificate_figures.order(values, sized, chosen[0] if chosen else None)
+        made["order"] = certificate_figures.order(sized, chosen[0] if chosen else None)
     return {name: style.png(figure) for name, figure in made.items()}
 
 
@@ -229,9 +225,7 @@ def _range_headline(calibration: Calibration) -> Headline:
 def _order_headline(calibration: Calibration) -> Headline:
     structure = calibration.certificate.get("structure")
     known = structure if isinstance(structure, Mapping) else tables.own_structure(calibration)
-    vote = number(calibration.certificate.get("singular_value_order"))
-    detail = "" if vote is None else f"states out of the noise, by singular values: {vote:.0f}"
-    return Headline("Structure", tables.structure_text(known), detail)
+    return Headline("Structure", tables.structure_text(known), "")
 
 
 def _departures(entries: tables.CertificateEntries) -> Section:

@@ -20,7 +20,7 @@ _SIGNIFICANT = 0.01
 # Coefficients are far more correlated than uncertain: to be of use they need their digits.
 _ALL_DIGITS = 10
 _SHOWN = {
-    "order", "structure", "singular_values", "singular_value_order", "candidates", "chi_square",
+    "order", "structure", "candidates", "chi_square",
     "residual_rms_m", "noise_m", "edges", "whiteness_p", "independence_p",
     "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
     "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
@@ -38,13 +38,6 @@ def listed(certificate: CertificateEntries, name: str) -> list[Mapping[str, Any]
     """The mappings in a list of the certificate; none if there is no such list."""
     entries = certificate.get(name)
     return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
-
-
-def numbers(certificate: CertificateEntries, name: str) -> list[float]:
-    """The numbers in a list of the certificate."""
-    entries = certificate.get(name)
-    known = [number(entry) for entry in entries] if isinstance(entries, list) else []
-    return [value for value in known if value is not None]
 
 
 def texts(certificate: CertificateEntries, name: str) -> list[str]:
@@ -122,12 +115,11 @@ def order_table(certificate: CertificateEntries) -> Table:
             structure_text(candidate),
             NOTHING if score is None else f"{score - least:.1f}",
             quantity(candidate.get("rms_m"), "m", 5),
-            quantity(candidate.get("held_out_m"), "m", 5),
             _remark(candidate, score == least, certificate),
         )
         for candidate, score in zip(candidates, scores, strict=True)
     ]
-    columns = ("BIC above lowest", "residual, rms", "on edges held out, rms", "")
+    columns = ("BIC above lowest", "residual, rms", "")
     return Table("Candidates", columns, rows)
 
 

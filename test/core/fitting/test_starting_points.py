@@ -5,15 +5,13 @@ import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_estimate import OrderEstimate
 from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.starting_points import StartingPoints
 
 PERIOD = 1e-3
-NO_VOTE = OrderEstimate(np.empty(0), 0, np.empty(0, complex))
 
 
-def points_for(dynamics, vote=NO_VOTE):
+def points_for(dynamics):
     time = np.arange(4000) * PERIOD
     motion = sum(1e-5 * np.exp(-(((time - c) / 4e-3) ** 2)) for c in np.arange(0.4, 3.6, 0.37))
     frequency = np.fft.rfftfreq(len(motion), PERIOD)
@@ -22,7 +20,7 @@ def points_for(dynamics, vote=NO_VOTE):
     used = np.ones(len(motion), bool)
     problem = Problem(motion, seen, used, PERIOD, np.ones((len(motion), 1)), 300.0)
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    return StartingPoints(problem, lag, vote)
+    return StartingPoints(problem, lag)
 
 
 def resonance(frequency, damping):
@@ -41,14 +39,6 @@ def test_linear_least_squares_finds_a_resonance_no_guess_would(frequency, dampin
     structure = Structure(2, 0, False)
     found = frequencies_of(points, structure, points.of(structure, []))
     assert min(abs(f / frequency - 1) for f in found) < 0.01
-
-
-def test_the_poles_of_the_subspace_method_are_one_start():
-    poles = np.array([-20 + 400j, -20 - 400j])
-    points = points_for(resonance(50.0, 0.3), OrderEstimate(np.array([2.0, 1.5]), 2, poles))
-    structure = Structure(2, 0, False)
-    found = frequencies_of(points, structure, points.of(structure, []))
-    assert any(f == pytest.approx(abs(poles[0]) / (2 * np.pi)) for f in found)
 
 
 def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():

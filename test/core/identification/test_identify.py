@@ -129,7 +129,6 @@ class TestStepTest:
 
     def test_a_candidate_names_its_scores(self):
         candidates = identified().certificate["candidates"]
-        assert any(c["held_out_m"] is not None for c in candidates)
         assert all(np.isfinite(c["bic"]) for c in candidates)
 
     def test_blocks_cut_anywhere_give_the_same(self):

@@ -288,8 +288,8 @@ class TestNumbers:
         rows = order_table(calibration.certificate).rows
         above = [float(row[1]) for row in rows]
         assert min(above) == 0
-        assert [row[0] for row in rows if "lowest" in row[4]] == [rows[int(np.argmin(above))][0]]
-        chosen = [row[0] for row in rows if "chosen" in row[4]]
+        assert [row[0] for row in rows if "lowest" in row[3]] == [rows[int(np.argmin(above))][0]]
+        chosen = [row[0] for row in rows if "chosen" in row[3]]
         assert chosen == [by_name(calibration)["Structure"]]
 
     def test_modes_say_whether_the_band_reaches_them(self, calibration):
@@ -439,18 +439,10 @@ class TestFigures:
 
         assert (rows(fitted), rows(replace(fitted, edges=()))) == (3, 2)
 
-    def test_states_and_noise_are_told_apart(self, calibration):
-        made = certificate_figures.order([60.0, 3.0, 0.9, 0.0], [], None)
-        (axes,) = made.get_axes()
-        points = {line.get_label(): list(line.get_ydata()) for line in axes.get_lines()}
-        assert points["state"] == [60.0, 3.0]
-        assert points["noise"] == [0.9, 0.0]
-        style.png(made, dpi=40)
-
     def test_the_chosen_candidate_is_marked(self):
         tried = [{"parameters": n, "rms_m": r, "bic": b} for n, r, b in
                  ((1, 30e-9, 9.0), (2, 11e-9, 1.0), (3, 10e-9, 2.0))]  # fmt: skip
-        (axes,) = certificate_figures.order([], tried, 2).get_axes()
+        (axes,) = certificate_figures.order(tried, 2).get_axes()
         marks = {line.get_label(): line.get_xydata()[0].tolist() for line in axes.get_lines()}
         assert marks["lowest BIC"] == pytest.approx([2, 11.0])
         assert marks["chosen"] == pytest.approx([3, 10.0])
