@@ -15,8 +15,12 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import wraps
+from typing import ParamSpec
+
+import numpy as np
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.response_band import ResponseLimits
@@ -32,8 +36,10 @@ from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.identification.two_masses import table_mass
 from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import IdentificationError
 
 DEFAULT_LIMITS = ResponseLimits()
+Parameters = ParamSpec("Parameters")
 # A calibration that is trusted nowhere says so by a frequency below anything that moves.
 _TRUSTED_NOWHERE_HZ = 1e-3
 
@@ -51,6 +57,25 @@ class Identification:
     fit: Fit
 
 
+def _solvable(
+    compute: Callable[Parameters, Identification],
+) -> Callable[Parameters, Identification]:
+    """Let no error of the linear algebra reach a user as such."""
+
+    @wraps(compute)
+    def computed(*args: Parameters.args, **options: Parameters.kwargs) -> Identification:
+        try:
+            return compute(*args, **options)
+        except np.linalg.LinAlgError as err:
+            raise IdentificationError(
+                f"the recording cannot be fitted ({err}): its numbers are extreme or repeat each "
+                "other; check the units of encoder and probe, and record again"
+            ) from err
+
+    return computed
+
+
+@_solvable
 def identify(
     record: MotionRecord,
     *,

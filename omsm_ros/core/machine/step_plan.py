@@ -52,6 +52,7 @@ def plan_steps(
     *,
     sample_period: float,
     step: float = 9.8e-6,
+    second_step: float | None = None,
     count: int = 10,
     dwell: float = 0.5,
     rise: float = 20e-3,
@@ -59,7 +60,10 @@ def plan_steps(
 ) -> StepPlan:
     """``count`` steps up and as many down, dithered within ``sample_period`` [s].
 
-    step: [m];  dwell: from edge to edge [s];  rise: of an edge [s]
+    step: [m];  second_step: of every other one [m], None for equal steps: two heights tell
+        what is not linear (backlash, friction, stiffening) from what only lags
+    dwell: from edge to edge [s], as long as the slowest relaxation that is to be told from gain
+    rise: of an edge [s]
     half_range: of the probe [m], which must hold the whole travel
 
     Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
@@ -69,7 +73,8 @@ def plan_steps(
             f"step plan: rise {rise!r} s is too sharp for samples every {sample_period!r} s; "
             f"use at least {_LEAST_RISE_SAMPLES * sample_period!r} s"
         )
-    if count * step > 2 * half_range:
+    upward = np.where(np.arange(count) % 2, step if second_step is None else second_step, step)
+    if np.sum(upward) > 2 * half_range:
         raise ConfigurationError(
             f"step plan: {count!r} steps of {step!r} m leave the probe's range of "
             f"±{half_range!r} m; use fewer or smaller steps"
@@ -80,7 +85,7 @@ def plan_steps(
         )
     edges = np.arange(1, 2 * count + 1)
     dither = (edges * _GOLDEN) % 1.0 * sample_period
-    heights = np.where(edges <= count, step, -step)
+    heights = np.concatenate([upward, -upward[::-1]])
     return StepPlan(
         tuple((edges * dwell + dither).tolist()),
         tuple(heights.tolist()),

@@ -32,7 +32,7 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD, LAG = 1e-3, 0.7e-3
 STEPS = StepTest()
@@ -281,3 +281,12 @@ def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell(
     (reason,) = gain_above_rest(1e-2, 5.0, 0.5, 5e-3).reasons
     assert "2 %" in reason
     assert "rest 5 s on each plateau" in reason
+
+
+def test_a_failure_of_the_algebra_is_one_clear_error(monkeypatch):
+    def fails(*_):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr("omsm_ros.core.identification.identify.prepare", fails)
+    with pytest.raises(IdentificationError, match=r"SVD did not converge.*check the units"):
+        identify(record_of())
