@@ -15,10 +15,11 @@ from omsm_ros.core.samples.blocks import FloatArray
 def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float) -> FloatArray:
     """Return sections (k, 6) as in scipy of ``gain · Π(1 - z_i/z) / Π(1 - p_i/z)``.
 
-    zeros, poles: in the z plane, complex ones with their conjugates, no more zeros than poles
+    zeros, poles: in the z plane, complex ones with their conjugates
     """
     # A root at the origin is a factor of 1.
-    count = max(len(poles) + len(poles) % 2, 2)
+    longest = max(len(zeros), len(poles), 1)
+    count = longest + longest % 2
     padded = [np.append(r, np.zeros(count - len(r))) for r in (zeros, poles)]
     remaining = list(padded[0])
     sections = []
