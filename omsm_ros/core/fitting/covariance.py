@@ -84,7 +84,7 @@ def parameter_covariance(
     strong, weak = directions[:, values > least], directions[:, values <= least]
     bread = strong / values[values > least] @ strong.T
     inside = bread @ (meat / np.outer(scale, scale)) @ bread
-    # Of a weak direction the data know nothing: at least as little as of the weakest strong one.
+    # A direction lost in rounding gets at least the variance of the weakest one that is not.
     inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
     covariance = inside / np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))

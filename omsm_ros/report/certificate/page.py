@@ -37,9 +37,9 @@ CAPTIONS = {
         "Gain, phase, and the error of a sinusoidal motion before and after the correction. "
         "Grey: not trusted."
     ),
-    "step": "The steepest move: what carriage and probe did, and what the model leaves of it.",
+    "step": "The steepest move: input, output, and the residual of the model.",
     "residual": (
-        "What the model leaves over the whole recording, at the edges on top of each other "
+        "The residual over the whole recording, at the edges on top of each other "
         "(downward ones turned over), and from sample to sample."
     ),
     "order": ("Each candidate is a structure that was fitted to the same samples."),
