@@ -145,8 +145,8 @@ def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
 def content_frequency(motion: FloatArray, sample_period: float) -> float:
     """Frequency [Hz] below which 99 % of the velocity's energy lies."""
     power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
-    share = np.cumsum(power) / np.sum(power)
-    place = int(np.searchsorted(share, 0.99)) + 1
+    # Compared without a division: of no motion, or of one too small to square, all is at rest.
+    place = int(np.searchsorted(np.cumsum(power), 0.99 * np.sum(power))) + 1
     return float(place / (len(motion) * sample_period))
 
 
