@@ -25,6 +25,7 @@ PARTS = (
         "speed",
         "offline",
         "live",
+        "devices",
         "real_data",
     ),
     "twin",

@@ -90,6 +90,10 @@ class ChrocodileSettings(BlockSettings):
             )
 
 
+class RefusedError(DeviceError):
+    """The device answered that it does not have the command, or not with this value."""
+
+
 class Chrocodile(StreamDevice):
     """Sets the device up, reads back what was set, and turns its signals into samples.
 
@@ -160,7 +164,7 @@ class Chrocodile(StreamDevice):
     def _prepare(self) -> None:
         wanted = self._wanted
         self._begin()
-        self._identity = {"model": self._ask("VER").text or "CHRocodile"}
+        self._identity = {"model": self._try("VER").text or "CHRocodile"}
         intact = self._ever_set_up and self._selected()
         if wanted.head is not None:
             self._set("SEN", wanted.head)
@@ -173,18 +177,25 @@ class Chrocodile(StreamDevice):
                 self._set(name, value)
         self._read_scale()
         if not intact:
-            self._ask(TRIGGERS[wanted.trigger])  # some of them start the counter anew
+            self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
             self._tracker.begin_anew()
         self._ever_set_up = True
         self._finish()
         self._asked = self._monotonic()
+
+    def _try(self, name: str, *arguments: str | float) -> Answer:
+        """The answer to a command that not every model has; an empty one if it is refused."""
+        try:
+            return self._ask(name, *arguments)
+        except RefusedError:
+            return Answer(b"", "")
 
     def _set(self, name: str, *values: float) -> None:
         """Set and read back; DeviceError if the device has other values then."""
         self._ask(name, *values)
         found = self._ask(name, QUERY).numbers
         self._identity[name] = " ".join(f"{number:g}" for number in found)
-        if found and not _agree(found, values):
+        if found and not _agree(found, values, within=0.0 if name == "SODX" else 1e-3):
             raise DeviceError(
                 f"{self._transport.name}: ${name} was set to {values!r}, the device has {found!r}; "
                 "choose a value that it accepts"
@@ -193,7 +204,7 @@ class Chrocodile(StreamDevice):
     def _set_rate(self) -> None:
         rate = 1 / self._wanted.sample_period
         free = self._wanted.trigger == "free_run"
-        self._ask("SHZ", rate if free else round(rate * _ABOVE_TRIGGER))
+        self._ask("SHZ", rate if free else float(round(rate * _ABOVE_TRIGGER)))
         found = self._ask("SHZ", QUERY).numbers
         if not found:
             return
@@ -210,7 +221,7 @@ class Chrocodile(StreamDevice):
             )
 
     def _read_scale(self) -> None:
-        found = self._ask("SCA", QUERY).numbers
+        found = self._try("SCA", QUERY).numbers
         if found and found[0] > 0:
             self._probe = replace(self._wanted.probe, full_scale=found[0] * MICROMETRE_M)
             self._identity["SCA"] = f"{found[0]:g}"
@@ -243,7 +254,7 @@ class Chrocodile(StreamDevice):
     def _selected(self) -> bool:
         """Whether the device still has our selection; one that was restarted has its own."""
         found = self._ask("SODX", QUERY).numbers
-        return not found or found == tuple(map(float, self._selection))
+        return not found or set(self._selection) <= set(found)
 
     def _converted(self, batches: Sequence[Records]) -> Samples:
         parts = [self._convert(records) for records in batches if len(records)]
@@ -263,9 +274,11 @@ class Chrocodile(StreamDevice):
         return samples
 
 
-def _agree(found: Sequence[float], wanted: Sequence[float]) -> bool:
-    """Whether an answer holds the values set; more numbers than those may follow."""
-    return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=1e-3)
+def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bool:
+    """Whether an answer holds the values set, each within a share of itself; more may follow."""
+    if within == 0:
+        return set(wanted) <= set(found)  # in the device's own order
+    return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)
 
 
 def _wrapping(axes: tuple[AxisScaling, ...] | None) -> tuple[AxisScaling, ...] | None:

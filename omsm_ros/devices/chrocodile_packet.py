@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from omsm_ros.devices.chrocodile import Chrocodile, ChrocodileSettings
+from omsm_ros.devices.chrocodile import Chrocodile, ChrocodileSettings, RefusedError
 from omsm_ros.devices.counting import SAMPLE, Samples
 from omsm_ros.devices.transport import Transport
 from omsm_ros.errors import DeviceError
@@ -59,11 +59,11 @@ class ChrocodilePacketDevice(Chrocodile):
         self._commands.clear()
         self._said = b""
         self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
-        self._ask("STO")
+        self._try("STO")
 
     def _finish(self) -> None:
         self._early.clear()  # measured before the device was set up
-        self._ask("STA")
+        self._try("STA")
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         self._ticket = (self._ticket + 1) % _TICKETS
@@ -83,7 +83,7 @@ class ChrocodilePacketDevice(Chrocodile):
             if not isinstance(value, bytes)
         )
         if answer.flags & ERROR:
-            raise DeviceError(
+            raise RefusedError(
                 f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose what it has"
             )
         return Answer(encode_command(asked), text)

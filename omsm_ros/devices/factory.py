@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from omsm_ros.devices.capancdt import CapaNcdtDevice, CapaNcdtSettings
@@ -20,6 +21,7 @@ from omsm_ros.devices.confocaldt import (
 from omsm_ros.devices.csv_stream import CsvSettings, CsvStreamDevice
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings
 from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.trace import TracedTransport
 from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
@@ -45,6 +47,7 @@ PARAMETERS = (
     Parameter("device", "six_channel", "what is connected: see the table of devices"),
     Parameter("port", "/tmp/omsm_cell", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, path"),
     Parameter("baud_rate", DEFAULT_BAUD_RATE, "of a serial port that does not name its own"),
+    Parameter("trace", "", "file for a trace of the wire; empty = none"),
     Parameter("sample_period", 1e-3, "of the trigger, or of a device that runs freely [s]"),
     Parameter("block_size", 100, "samples in a message"),
     *(
@@ -115,7 +118,10 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
     make = DEVICES.get(values["device"])
     if make is None:
         raise ConfigurationError(f"device {values['device']!r}, expected one of {sorted(DEVICES)}")
-    return make(values, transport_for(values["port"], values["baud_rate"]), now_ns)
+    transport = transport_for(values["port"], values["baud_rate"])
+    if values["trace"]:
+        transport = TracedTransport(transport, Path(values["trace"]))
+    return make(values, transport, now_ns)
 
 
 def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:

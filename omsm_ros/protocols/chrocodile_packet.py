@@ -26,6 +26,8 @@ QUERY, UPDATE, WARNING, ERROR = 0x0001, 0x2000, 0x4000, 0x8000
 INT, REAL, STRING, CHAR, BLOB = range(5)
 # The last update after connecting.
 CONFIGURED = "CONF"
+# No probe measures slower or faster; another rate is a damaged packet.
+LEAST_RATE_HZ, GREATEST_RATE_HZ = 1e-3, 1e8
 # Of a triggered sample: its time after the packet's [s / 2^32].
 TIME_OFFSET = 91
 
@@ -182,6 +184,8 @@ def decode_format(body: bytes) -> DataFormat:
     signals = tuple((number, kind, channels) for kind, _, channels, _, number in rows)
     numbers = [number for number, _, _ in signals]
     known = all(kind in FORMATS and channels > 0 for _, kind, channels in signals)
-    if not signals or not known or len(set(numbers)) < count or not 0 < rate < np.inf:
+    offset = next((kind for number, kind, _ in signals if number == TIME_OFFSET), S32)
+    sound = known and offset == S32 and LEAST_RATE_HZ <= rate <= GREATEST_RATE_HZ
+    if not signals or not sound or len(set(numbers)) < count:
         raise ProtocolError(f"data format of {rate!r} Hz with signals {signals!r}")
     return DataFormat(counter, rate, signals, stream)

@@ -16,6 +16,7 @@ from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
 from omsm_ros.emulators.instrument import Instrument
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.protocols.chrocodile_telegram import Layout
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
@@ -234,6 +235,29 @@ def test_a_setting_that_is_not_taken_is_named(bench: Any) -> None:
     run = bench(Stubborn, ChrocodileDevice, replace(SIX, lamp=40.0))
     with pytest.raises(DeviceError, match=r"\$SODX was set to .* the device has \(256.0, 257.0\)"):
         run.device.open()
+
+
+class OwnOrder(ChrocodileEmulator):
+    """Reads its selection back, and sends it, in its own order."""
+
+    def _answer(self, request: Any) -> str:
+        text = super()._answer(request)
+        if request.name == "SODX" and request.arguments != ("?",):
+            numbers = sorted(map(int, request.arguments))
+            self._values["SODX"] = " ".join(map(str, numbers))
+            self._layout = Layout.of(numbers)
+        return text
+
+
+def test_the_devices_own_order_is_read(bench: Any) -> None:
+    run = bench(OwnOrder, ChrocodileDevice, SIX)
+    run.run(1.0)
+    run.instrument.unplug(0.5)
+    run.run(2.0)
+    run.end()
+    run.check()
+    assert run.delivered > 1500
+    assert run.device.statistics.restarts == 0
 
 
 class Banner(ChrocodileEmulator):

@@ -121,6 +121,17 @@ def test_a_refusal_is_named(cell: Any) -> None:
         run.device.open()
 
 
+def test_a_model_without_some_commands_is_set_up_all_the_same(cell: Any) -> None:
+    run = cell()
+    usual = run.instrument._answer
+    lacks = ("VER", "SCA", "STO", "STA", "CTN")
+    run.instrument._answer = lambda r: "not valid" if r.name in lacks else usual(r)
+    run.run(1.0)
+    run.end()
+    run.check()
+    assert run.delivered > 700
+
+
 def test_another_service_on_the_port_is_named(cell: Any) -> None:
     run = cell()
     run.instrument.greet = lambda: run.instrument.say(b"SSH-2.0-OpenSSH_9.6\r\n")

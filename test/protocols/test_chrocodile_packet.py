@@ -178,6 +178,8 @@ def test_data_of_an_unknown_format_are_counted() -> None:
         DataFormat(1, 1.0, ((83, 2, 1), (83, 2, 1))),
         DataFormat(1, 1.0, ((83, 9, 1),)),
         DataFormat(1, 1.0, ()),
+        DataFormat(1, 1e-30, ((83, 2, 1),)),
+        DataFormat(1, 1.0, ((91, 6, 1),)),
     ],
 )
 def test_a_senseless_format_is_malformed(form: DataFormat) -> None:

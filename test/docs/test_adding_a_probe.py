@@ -1,0 +1,35 @@
+"""The worked example of the page does what the page says."""
+
+import re
+from pathlib import Path
+
+import omsm_ros
+
+PAGE = Path(omsm_ros.__file__).resolve().parent.parent / "docs" / "adding_a_probe.md"
+
+
+def test_the_page_runs_from_top_to_bottom():
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 4
+    names = {"__name__": "page"}
+    exec("\n".join(blocks), names)
+    assert len(names["blocks"]) > 30
+
+
+def test_every_name_the_page_points_at_exists():
+    from omsm_ros.devices.factory import DEVICES, PARAMETERS
+    from omsm_ros.devices.trace import ReplayTransport
+    from omsm_ros.emulators.players import EMULATED
+
+    assert DEVICES
+    assert PARAMETERS
+    assert EMULATED
+    assert ReplayTransport.name == "trace"
+
+
+def test_every_device_stands_in_the_table():
+    from omsm_ros.devices.factory import DEVICES
+
+    table = (PAGE.parent / "devices.md").read_text(encoding="utf-8")
+    for name in DEVICES:
+        assert f"| `{name}` |" in table
