@@ -43,6 +43,9 @@ _POWER = 1.645
 _BENDING = (MODE, STIFFENING)
 # Decades of time between a structure's slowest motion and the length of a record.
 _DECADES = 3.0
+# What creeps within the record creeps on beyond it, about as much in each of three decades from
+# none to all: a uniform distribution, whose standard deviation is 1/√3 of its end.
+_UNSEEN = _DECADES / 3**0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +106,11 @@ def _worst(relaxations: list[HiddenTerm], found: float) -> HiddenTerm:
             replace(term, size=min(term.size, limit), uncertainty=min(term.uncertainty, limit))
             for term in relaxations
         ]
-    return max(relaxations, key=lambda term: term.effect * term.carried)
+    worst = max(relaxations, key=lambda term: term.effect * term.carried)
+    slower = _UNSEEN * found
+    if worst.above > 0 and worst.carried * worst.above < slower:
+        worst = replace(worst, size=0.0, uncertainty=slower / worst.above)
+    return worst
 
 
 def relaxation_found(dynamics: TransferFunction) -> float:
