@@ -27,6 +27,7 @@ PARTS = (
         "live",
         "devices",
         "real_data",
+        "selfcal",
     ),
     "twin",
 )

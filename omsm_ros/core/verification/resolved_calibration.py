@@ -79,7 +79,11 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     jacobian = slow_motion_jacobian(g)
     prior = jacobian @ sigma @ jacobian.T
     gain = sigma @ jacobian.T @ _inverse_of_what_varies(prior)
-    change = prior - found.covariance[:GAIN, :GAIN]
+    left = found.covariance[:GAIN, :GAIN].copy()
+    if len(g.numerator) <= CURVATURE + 1:
+        # A numerator of the first degree has no room for the curvature: it stays, and counts.
+        left[CURVATURE, CURVATURE] += float(found.values[CURVATURE]) ** 2
+    change = prior - left
     covariance = sigma - gain @ change @ gain.T
     lag = g.low_frequency_delay
     certificate = {
@@ -150,12 +154,12 @@ def _moved(
 ) -> tuple[TransferFunction, FloatArray]:
     """G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
 
-    Only the numerator changes, so the poles stay where they are; it grows to the second
-    degree where the denominator allows it.
+    Only the numerator changes, so the poles stay where they are. It grows to the first degree
+    where the denominator allows it, to hold the lag, and no further, to stay a small model.
     """
     g = calibration.dynamics
     degree = len(g.numerator) - 1
-    wanted = min(max(degree, 2), len(g.denominator) - 1)
+    wanted = min(max(degree, 1), len(g.denominator) - 1)
     grown = [0.0] * (wanted - degree)
     numerator = np.append(g.numerator, grown)
     factor = np.array([1.0, -lag, curvature])[: min(wanted, 2) + 1]

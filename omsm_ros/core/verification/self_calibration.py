@@ -187,10 +187,15 @@ class _Fit:
     @property
     def unknown(self) -> BoolArray:
         """Which of the four neither the prior nor the scans tell, (4,)."""
-        posterior = np.diag(_inverse(self._matrix))[:DYNAMIC]
+        inverse = _inverse(self._matrix)
+        posterior = np.diag(inverse + self._by_gain(inverse))[:DYNAMIC]
         assumed = np.diag(self._prior.covariance)
         wide = assumed >= np.array([WIDE_S, WIDE_CURVATURE_S2, np.inf, WIDE_S]) ** 2 / 4
-        return np.asarray(self._omitted | (wide & (posterior > _KNOWN**2 * assumed)))
+        limit = _KNOWN**2 * assumed
+        if wide[LAG]:
+            # Without a step test latency shows in third order of the following error alone.
+            limit[LATENCY] = _USEFUL_S**2
+        return np.asarray(self._omitted | (wide & (posterior > limit)))
 
     def _iterate(self) -> None:
         """Converge on some of the points; for that is only to know where to linearise."""
@@ -259,7 +264,9 @@ class _Fit:
         It is not estimated: on a surface that Z follows it shows in third order of the following
         error only, where other terms that are not modelled show too.
         """
-        change = -inverse @ self._equations.matrix[:, GAIN] / self._variance
+        column = self._matrix[:, GAIN].copy()
+        column[GAIN] = 0.0
+        change = -inverse @ column
         change[GAIN] = 1.0
         return np.asarray(np.outer(change, change) * self._prior.covariance[GAIN, GAIN])
 
