@@ -110,6 +110,8 @@ def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> F
     A motion that breaks off would have content at all frequencies, where there was none.
     """
     length = min(round(_FADE_S / period), len(motion) // 5)
+    if length == 0:  # the fade is shorter than a sample
+        return motion
     rising = np.cumsum(signal.windows.kaiser(length, _FADE_SHAPE))
     rising = rising / rising[-1]
     carried = motion.copy()

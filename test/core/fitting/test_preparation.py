@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.fitting.periodic_input import close_period
-from omsm_ros.core.fitting.preparation import content_frequency, prepare
+from omsm_ros.core.fitting.preparation import content_frequency, from_rest_to_rest, prepare
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError
@@ -104,3 +104,15 @@ def test_what_rests_at_both_ends_is_left_as_it_is():
     np.testing.assert_allclose(np.diff(problem.input), np.diff(recorded.z), atol=1e-18)
     assert problem.used[60]
     assert problem.used[-10]
+
+
+@pytest.mark.parametrize(("samples", "period"), [(4, 1e-3), (50, 10.0)])
+def test_a_fade_shorter_than_a_sample_changes_nothing(samples: int, period: float) -> None:
+    motion = np.arange(samples, dtype=np.float64)
+    moving = np.ones(samples, np.bool_)
+    assert np.array_equal(from_rest_to_rest(motion, moving, period), motion)
+
+
+def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
+    motion = 1e-300 * np.arange(100.0)
+    assert content_frequency(motion, 1e-3) == pytest.approx(1 / (100 * 1e-3))
