@@ -29,9 +29,10 @@ def account(cell, stream):
     return counts
 
 
-def test_calibrate_scan_correct_and_replay(cell):
+@pytest.mark.parametrize("device", ["six_channel", "chrocodile"])
+def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(
-        cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=1e-3
+        cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=1e-3, device=device
     )
     plan.prepare()
     perform(cell.operator, cell.processes, plan, Stage(quiet=True))
