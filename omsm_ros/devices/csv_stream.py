@@ -45,6 +45,7 @@ class CsvStreamDevice(StreamDevice):
     ) -> None:
         settings = settings or CsvSettings()
         self._decoder = CsvDecoder(settings.columns)
+        self._unread = 0
         self._columns, self._probe = settings.columns, settings.scaling.probe
         timed = "device_time" in settings.columns
         has_axes = bool(set(AXIS_COLUMNS) & set(settings.columns))
@@ -59,9 +60,11 @@ class CsvStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         self._decoder.reset()
+        self._unread = 0
 
     def _decode(self, data: bytes) -> Samples:
         rows = self._decoder.feed(data)
+        self._unread = 0 if len(rows) else self._unread + len(data.strip())
         samples = np.zeros(len(rows), SAMPLE)
         samples["counter"] = rows["sequence"]
         samples["intensity"] = np.nan
@@ -82,6 +85,9 @@ class CsvStreamDevice(StreamDevice):
                 inside = np.clip(rows[name], -(2**40), 2**40)
                 samples["counts"][:, index] = np.rint(inside * _PARTS).astype(np.int64)
         return samples
+
+    def _listen_in(self, silent: float) -> None:
+        self._check_understood(silent, self._unread)
 
 
 def _in_parts(axis: AxisScaling) -> AxisScaling:

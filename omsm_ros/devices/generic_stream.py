@@ -55,6 +55,7 @@ class GenericStreamDevice(StreamDevice):
         self.unknown_status = 0
         self._scaling = settings.scaling
         self._decoder = FrameDecoder()
+        self._unread = 0
 
     @property
     def wire(self) -> DecoderStatistics:
@@ -67,11 +68,17 @@ class GenericStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         self._decoder.reset()
+        self._unread = 0
 
     def _decode(self, data: bytes) -> Samples:
         frames = self._decoder.feed(data)
+        # Zeros are an idle line.
+        self._unread = 0 if len(frames) else self._unread + len(data) - data.count(0)
         self.unknown_status += int(np.sum(~known_status(frames)))
         return samples_of(frames, self._scaling)
+
+    def _listen_in(self, silent: float) -> None:
+        self._check_understood(silent, self._unread)
 
 
 def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:

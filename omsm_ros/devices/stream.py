@@ -15,6 +15,10 @@ import numpy as np
 from omsm_ros.devices.blocks import BlockCutter, BlockPair, BlockSettings, Channels
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples, SequenceTracker
 from omsm_ros.devices.transport import Transport
+from omsm_ros.errors import DeviceError
+
+# Bytes without a sample for so long are another device's, or come at another baud rate.
+UNREADABLE_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,6 +170,17 @@ class StreamDevice:
         """Nothing came for ``silent`` [s]: raise DeviceError if the device is gone."""
 
     # --- common
+
+    def _check_understood(self, silent: float, unread: int) -> None:
+        """Raise DeviceError if bytes keep coming, but for ``silent`` [s] no sample in them.
+
+        unread: bytes that came since the last sample, an idle line's left out
+        """
+        if silent > UNREADABLE_S and unread:
+            raise DeviceError(
+                f"{self._transport.name} sends bytes ({unread} in {silent:.1f} s), but no samples "
+                "of this device; check the baud rate and what is connected"
+            )
 
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
         self._decoded += len(samples)

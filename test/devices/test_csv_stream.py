@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.devices.csv_stream import CsvSettings, CsvStreamDevice
+from omsm_ros.devices.generic_stream import GenericStreamDevice
 from omsm_ros.emulators.csv_stream import CsvStreamEmulator
 from omsm_ros.emulators.instrument import Instrument
 from omsm_ros.protocols.generic_stream import AxisScaling, StreamScaling
@@ -63,3 +64,39 @@ def test_axes_in_millimetres_without_a_probe(bench: Any) -> None:
         k = block.axes.first_sample + np.arange(len(block.axes))
         np.testing.assert_allclose(block.axes.z, k % 1000 * 1e-6, atol=1e-9)
         assert (block.axes.x == 0.25).all()
+
+
+class Banner(Instrument):
+    """Another service on the port: it talks, but not of samples."""
+
+    def pack(self, measured: Any, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        return [b"\xff\x12login:"] * len(measured)
+
+
+@pytest.mark.parametrize("device", [CsvStreamDevice, GenericStreamDevice])
+def test_bytes_that_are_no_samples_are_told(bench: Any, device: Any) -> None:
+    run = bench(Banner, device, None)
+    run.run(4.0)
+    assert run.delivered == 0
+    assert "no samples of this device; check the baud rate and what is connected" in run.troubles[0]
+
+
+class Idle(Instrument):
+    """A sender between triggers."""
+
+    def pack(self, measured: Any, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        return [b"\0\0"] * len(measured)
+
+
+def test_an_idle_line_is_no_trouble(bench: Any) -> None:
+    run = bench(Idle, GenericStreamDevice, None)
+    run.run(6.0)
+    assert run.troubles == []
+
+
+@pytest.mark.parametrize("device", [CsvStreamDevice, GenericStreamDevice])
+def test_a_quiet_line_is_no_trouble(bench: Any, device: Any) -> None:
+    run = bench(Banner, device, None, triggered=True)
+    run.run(6.0)
+    assert run.troubles == []
+    assert run.connections == 1
