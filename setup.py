@@ -14,6 +14,7 @@ NODES = (
     "corrector",
     "calibrator",
     "confocal_driver",
+    "axis_driver",
     "reference_driver",
     "recorder",
     "cell_emulator",

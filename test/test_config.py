@@ -1,6 +1,7 @@
 """The shipped YAML files name exactly the parameters that the nodes declare."""
 
 import ast
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -64,3 +65,10 @@ def test_shipped_surface_is_the_papers():
     from omsm_ros.core.surface.nominal import PAPER_MIRROR
 
     assert load_surface(ROOT / "config" / "paper_mirror.yaml") == PAPER_MIRROR
+
+
+def test_every_node_can_be_started_by_its_name():
+    listed = (ROOT / "setup.py").read_text().split("NODES =")[1].split("\n)\n")[0]
+    named = set(re.findall(r'"(\w+)"', listed))
+    nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
+    assert named == nodes

@@ -133,8 +133,7 @@ class CapaNcdtDevice(StreamDevice):
     def _listen_in(self, silent: float) -> None:
         if not self._wanted.triggered and silent > self._wanted.patience:
             raise DeviceError(
-                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network; "
-                "connecting again"
+                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
             )
 
 

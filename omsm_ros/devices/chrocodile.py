@@ -242,13 +242,10 @@ class Chrocodile(StreamDevice):
             return
         self._asked = now
         if not self._selected():
-            raise DeviceError(
-                f"{self._transport.name} lost its settings (a restart?); setting it up again"
-            )
+            raise DeviceError(f"{self._transport.name} lost its settings (a restart?)")
         if self._wanted.trigger == "free_run":
             raise DeviceError(
-                f"{self._transport.name} answers, but sent no telegram for {silent:.1f} s; "
-                "setting it up again"
+                f"{self._transport.name} answers, but sent no telegram for {silent:.1f} s"
             )
 
     def _selected(self) -> bool:

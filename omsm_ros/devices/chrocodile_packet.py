@@ -123,7 +123,7 @@ class ChrocodilePacketDevice(Chrocodile):
         if missing := set(self._selection) - set(self._signals):
             raise DeviceError(
                 f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
-                f"sends {self._signals!r}; setting it up again"
+                f"sends {self._signals!r}; choose signals that it has"
             )
         samples = self._convert(message.records)
         samples["time"] = message.times_ns

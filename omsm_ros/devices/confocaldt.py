@@ -227,7 +227,7 @@ def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
     if settings.period and silent > settings.patience:
         raise DeviceError(
             f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "
-            "interface and (RS-422) baud rate; connecting again"
+            "interface and (RS-422) baud rate"
         )
 
 
