@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from omsm_ros.core.verification.repeatability import Repeatability, repeatabilit
 from omsm_ros.jobs.verify_calibration import path_check_of
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import save_text
-from omsm_ros.units import DEGREE_RAD, NANOMETRE_M
+from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, NANOMETRE_M
 
 # A second height that is no simple part of the first: 3 µm beside 9.8 µm.
 _SECOND_SHARE = 3 / 9.8
@@ -108,7 +109,12 @@ def _declare_plan(sub: argparse.ArgumentParser) -> None:
     for name, quantity, default, meaning in (
         ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "of the probe [s]"),
         ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
-        ("--second-step", quantities.STEP, None, "of every other step [m]; 0.3 of it by default"),
+        (
+            "--second-step",
+            quantities.STEP,
+            None,
+            "of every other step [m]; 3/9.8 of --step by default",
+        ),
         ("--count", quantities.COUNT, 10, "steps up; as many follow down"),
         ("--dwell", quantities.DWELL, 0.5, "from edge to edge [s]"),
         ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
@@ -132,16 +138,23 @@ def _plan(args: argparse.Namespace) -> Facts:
     save_text(gcode, plan_gcode(plan))
     return {
         "edges": len(plan.starts),
+        "heights": sorted(set(map(abs, plan.heights)), reverse=True),
+        "travel": plan.travel,
         "duration": plan.duration,
         "rise": plan.rise,
         "files": {"csv": str(csv), "gcode": str(gcode)},
     }
 
 
+def _micrometres(lengths: Sequence[float]) -> str:
+    return " and ".join(f"{length / MICROMETRE_M:g}" for length in lengths) + " µm"
+
+
 def _show_plan(facts: Facts) -> None:
     table(
         [
-            ("edges", str(facts["edges"])),
+            ("edges", f"{facts['edges']} of {_micrometres(facts['heights'])}"),
+            ("travel", _micrometres([facts["travel"]])),
             ("duration", f"{facts['duration']:g} s"),
             ("rise", f"{facts['rise'] * 1e3:g} ms, dithered within the sample period"),
             ("written", ", ".join(facts["files"].values())),

@@ -47,10 +47,21 @@ def test_plan_writes_what_the_machine_can_run(capsys, tmp_path):
     found = facts(capsys, "plan", "steps", "--out", tmp_path, "--count", 5)
     assert found["edges"] == 10
     table = np.loadtxt(tmp_path / "steps.csv", delimiter=",", skiprows=1)
-    assert np.ptp(table[:, 1]) == pytest.approx(5 * 9.8e-6)
+    # Two heights tell what is not linear: three steps of 9.8 µm and two of 3 µm between them.
+    assert found["heights"] == pytest.approx([9.8e-6, 3e-6])
+    assert np.ptp(table[:, 1]) == pytest.approx(3 * 9.8e-6 + 2 * 3e-6)
+    assert found["travel"] == pytest.approx(np.ptp(table[:, 1]))
     # Ten samples or more on every edge: nothing happens between two samples.
     assert np.abs(np.diff(table[:, 1])).max() < 9.8e-6 / 5
     assert "G21" in (tmp_path / "steps.nc").read_text()
+
+
+def test_plan_writes_equal_steps_when_told(capsys, tmp_path):
+    sizes = ("--step", 9.8e-6, "--second-step", 9.8e-6)
+    found = facts(capsys, "plan", "steps", "--out", tmp_path, "--count", 5, *sizes)
+    table = np.loadtxt(tmp_path / "steps.csv", delimiter=",", skiprows=1)
+    assert found["travel"] == pytest.approx(5 * 9.8e-6)
+    assert np.ptp(table[:, 1]) == pytest.approx(5 * 9.8e-6)
 
 
 def test_plan_refuses_what_the_probe_cannot_follow(capsys, tmp_path):

@@ -35,6 +35,11 @@ class StepPlan:
     rise: float
     duration: float
 
+    @property
+    def travel(self) -> float:
+        """Height of the topmost plateau over the start [m]."""
+        return float(max(np.cumsum(self.heights)))
+
     def z(self, time: FloatArray) -> FloatArray:
         """Commanded position [m] at ``time`` [s], of the same shape."""
         position = np.zeros_like(time)
@@ -74,9 +79,10 @@ def plan_steps(
             f"use at least {_LEAST_RISE_SAMPLES * sample_period!r} s"
         )
     upward = np.where(np.arange(count) % 2, step if second_step is None else second_step, step)
-    if np.sum(upward) > 2 * half_range:
+    travel = float(np.sum(upward))
+    if travel > 2 * half_range:
         raise ConfigurationError(
-            f"step plan: {count!r} steps of {step!r} m leave the probe's range of "
+            f"step plan: {count!r} steps travel {travel:.4g} m, which leaves the probe's range of "
             f"±{half_range!r} m; use fewer or smaller steps"
         )
     if dwell < 3 * rise:

@@ -75,9 +75,10 @@ def test_two_heights_alternate_and_come_back_to_the_start():
     assert plan.heights[:4] == (9.8e-6, 3e-6, 9.8e-6, 3e-6)
     assert sum(plan.heights) == pytest.approx(0.0, abs=1e-18)
     assert np.max(plan.z(np.linspace(0, plan.duration, 1000))) == pytest.approx(64e-6)
+    assert plan.travel == pytest.approx(64e-6)
 
 
 def test_a_smaller_second_step_makes_room_for_more():
     plan_steps(sample_period=1e-3, second_step=3e-6, count=15)
-    with pytest.raises(ConfigurationError, match="range"):
+    with pytest.raises(ConfigurationError, match=r"15 steps travel 0.000147 m.*range"):
         plan_steps(sample_period=1e-3, count=15)
