@@ -59,9 +59,23 @@ def held_zeros(
     finite = np.diag(np.append(np.ones(n + order), 0.0))
     found = generalised_eigenvalues(pencil, finite)
     found = found[np.isfinite(found) & (abs(found) < _FAR_ZERO)]
-    found[np.argsort(abs(found - 1))[:at_rest]] = 1.0
+    found = _with_exact_ones(found, at_rest)
     upper = found[found.imag > 0]
     return np.concatenate([upper, upper.conj(), found[found.imag == 0]])
+
+
+def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
+    """Put 1 in the place of the ``count`` zeros nearest to it.
+
+    Rounding may make a conjugate pair of one of them and a slow zero beside it: that one then
+    gets what 1 leaves of the sum of the pair, which rounding does not move.
+    """
+    nearest = found[np.argsort(abs(found - 1))]
+    taken, others = nearest[:count], nearest[count:]
+    if np.sum(taken.imag > 0) != np.sum(taken.imag < 0):
+        partner = int(np.argmin(abs(others - np.conj(taken[-1]))))
+        others[partner] = 2 * taken[-1].real - 1
+    return np.asarray(np.append(np.ones(len(taken)), others), np.complex128)
 
 
 def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:

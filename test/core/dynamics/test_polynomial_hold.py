@@ -94,3 +94,16 @@ def test_the_exponential_is_that_of_scipy(size: float) -> None:
 
 def test_the_exponential_of_nothing_is_one() -> None:
     assert np.array_equal(matrix_exponential(np.zeros((2, 2))), np.eye(2))
+
+
+@pytest.mark.parametrize("slow", [-6e-3, -3e-3, 1e-3])
+@pytest.mark.parametrize("fast", [1.0, 2.0, 3.0])
+def test_a_slow_zero_beside_one_at_rest_is_not_lost_nor_doubled(slow: float, fast: float) -> None:
+    """Rounding makes a conjugate pair of the two: 1 takes the place of one, the other stays."""
+    above = [-21 + 55j, -21 - 55j, -29 + 14j, -29 - 14j]
+    poles = np.array([*above, -0.08, *above, -0.08, -6e-3]) * fast
+    zeros = np.array([1443.0, -4 + 33j, -4 - 33j, -22, 0.19, -0.1, -0.014, slow, 9e-4, 0j]) * fast
+    found = held_zeros(zeros, poles, 5, at_rest=1)
+    assert len(found) == len(poles) + 5
+    assert np.array_equal(np.sort_complex(found), np.sort_complex(found.conj()))
+    assert np.count_nonzero(found == 1.0) == 1
