@@ -21,6 +21,7 @@ from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface import nominal
 from omsm_ros.storage import machine_files
@@ -118,7 +119,10 @@ def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibrat
     )
 
     def corrected(**sources):
-        options = CorrectionOptions(sources=ErrorSources(**sources))
+        # A pitch moves a beam one metre off the encoder's line by a metre a radian.
+        options = CorrectionOptions(
+            geometry=Geometry(abbe_arm=1.0), sources=ErrorSources(**sources)
+        )
         corrector = Corrector(true_calibration, options)
         corrector.push_axes(axes)
         corrector.push_distance(distance)

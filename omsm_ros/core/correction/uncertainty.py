@@ -129,7 +129,7 @@ def contributions(
         "encoder_resolution": (noise_gain * sources.encoder_resolution) ** 2 / 12,
         "motion_error": sources.motion_error**2,
         "discretisation": sources.discretisation**2,
-        "abbe": (abbe_arm * sources.pitch) ** 2,
+        "pitch": (abbe_arm * sources.pitch) ** 2,
     }
 
 
@@ -217,7 +217,7 @@ def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> F
         rows[i, i : i + n + 1] = denominator
     for i in range(1, n + 1):
         rows[m + i, i : i + m + 1] = -numerator
-    rows[-1, 1 : m + n + 2] = -polynomial.polymul(numerator, denominator)
+    rows[-1, 1 : m + n + 2] = -np.convolve(numerator, denominator)
     return rows
 
 

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from numpy.polynomial import polynomial
 from scipy import signal
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -166,6 +167,39 @@ def test_a_sharp_resonance_near_the_sample_rate_still_has_sensitivities() -> Non
     assert np.allclose(total, expected, rtol=0.02)
 
 
+@pytest.mark.parametrize("certificate", [{}, {"valid_from": 0.5}])
+@pytest.mark.parametrize("zeros", [[-900.0, 2500.0], [-300 + 700j, -300 - 700j]])
+@pytest.mark.parametrize("extra", [0, 1])
+def test_a_numerator_of_the_degree_of_the_denominator_has_sensitivities(
+    certificate: dict[str, float], zeros: list[complex], extra: int
+) -> None:
+    """Every parameter in play, and a further coefficient that is zero and fixed."""
+    poles = [-500 + 1200j, -500 - 1200j, *[-2000.0] * extra]
+    rising, falling = (np.real(polynomial.polyfromroots(roots)) for roots in (zeros, poles))
+    padded = np.append(rising, np.zeros(extra)) * falling[0] / rising[0]
+    g = TransferFunction.from_ascending(padded, falling, 0.3e-3)
+    values = np.concatenate([g.numerator, g.denominator[1:], [g.delay]])
+    deviations = 1e-3 * values
+    if not certificate:
+        deviations[0] = 0.0
+    known = calibration(np.diag(deviations**2), dynamics=g, certificate=certificate)
+    frequency = np.array([1.0, 10.0, 40.0])
+    total = sum(abs(f.response(frequency)) ** 2 for f in sensitivity_filters(known, PERIOD))
+    m = len(g.numerator)
+
+    def varied(j: int, by: float) -> np.ndarray:
+        moved = values + by * (np.arange(len(values)) == j)
+        return TransferFunction(moved[:m], np.r_[1.0, moved[m:-1]], moved[-1]).response(frequency)
+
+    expected = sum(
+        abs(varied(j, d) - varied(j, -d)) ** 2 / 4 for j, d in enumerate(deviations) if d
+    )
+    if certificate:
+        ratio = frequency / certificate["valid_from"]
+        expected = expected * ratio**2 / (1 + ratio**2)
+    assert np.allclose(np.sqrt(total), np.sqrt(expected), rtol=0.02)
+
+
 def test_a_known_response_needs_no_filters() -> None:
     assert sensitivity_filters(calibration(np.zeros((7, 7))), PERIOD) == []
 
@@ -196,7 +230,7 @@ def test_contributions_by_hand() -> None:
     assert found["static_gain"] == pytest.approx([0.0, 1.6**2])
     assert found["discretisation"] == 25.0
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
-    assert found["abbe"] == pytest.approx((200e-9) ** 2)
+    assert found["pitch"] == pytest.approx((200e-9) ** 2)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
     assert found["lateral_lag"] == pytest.approx([9.0, 10.0])
 

@@ -140,7 +140,7 @@ def test_a_mapping_keeps_its_names_and_writes_its_values_as_json():
 
 class TestBudgetAndMotion:
     def test_the_largest_part_comes_first_and_nothing_is_left_out_but_zero(self):
-        budget = {"encoder_noise": 1e-9, "probe_noise": 1e-8, "abbe": 0.0}
+        budget = {"encoder_noise": 1e-9, "probe_noise": 1e-8, "pitch": 0.0}
         rows = tables.budget_table({"uncertainty_budget": budget}).rows
         assert [row[0] for row in rows] == ["probe noise", "encoder noise"]
         assert plain(rows[0][1]) == "10.0 nm"
