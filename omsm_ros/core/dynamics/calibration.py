@@ -66,6 +66,27 @@ class Calibration:
         """Standard uncertainty of the delay of slow motion [s]."""
         return low_frequency_delay_uncertainty(self.dynamics, self.covariance)
 
+    @property
+    def noise_covariance(self) -> FloatArray:
+        """Covariance (p, p) by which repeated step tests of one machine scatter.
+
+        ``covariance`` holds besides what could hide in every one of them alike. Equal to it
+        where the certificate does not tell the two apart.
+        """
+        stated = self.certificate.get("noise_covariance")
+        if (
+            not isinstance(stated, list)
+            or len(stated) != self.covariance.size
+            or not all(type(value) in (int, float) for value in stated)
+        ):
+            return self.covariance
+        return np.asarray(stated, np.float64).reshape(self.covariance.shape)
+
+    @property
+    def low_frequency_delay_noise(self) -> float:
+        """Standard deviation of the delay of slow motion [s] over repeated step tests."""
+        return low_frequency_delay_uncertainty(self.dynamics, self.noise_covariance)
+
     def content(self) -> dict[str, object]:
         """The calibration as JSON values, without its id."""
         return {

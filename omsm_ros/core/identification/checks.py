@@ -113,12 +113,18 @@ def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float)
 
 
 CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
+    # What the motion cannot tell makes every other finding meaningless.
+    lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
     lambda e: departures(e.searched),
     lambda e: independence(e.searched.survey.independence),
     lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),
-    lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
+)
+"""What may be wrong with the record or the model."""
+
+RANGE_CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: trusted_range(e.known.valid_up_to, e.limits),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),
     lambda e: poles_beyond(e.dynamics, e.known.valid_up_to, 0.5 / e.prepared.problem.period),
 )
+"""How far the result is trusted: what is open comes before how far that reaches."""

@@ -172,10 +172,22 @@ def gain_above_rest(size: float, time_constant: float, plateau: float, limit: fl
         entries,
         reasons=(
             f"drift or creep leaves the gain of what moves open by {wide:.2g} % against that at "
-            f"rest, at most {allowed:.2g} % are allowed: a relaxation of {time_constant:.2g} s "
-            f"does not show on plateaus of {plateau:.2g} s; let the machine settle and rest "
-            f"{time_constant:.2g} s on each plateau (omsm plan steps --dwell)",
+            f"rest, at most {allowed:.2g} % are allowed: "
+            + _plateau_that_would_tell(time_constant, plateau),
         ),
+    )
+
+
+def _plateau_that_would_tell(time_constant: float, plateau: float) -> str:
+    if time_constant <= plateau:
+        return (
+            f"in this motion a relaxation of {time_constant:.2g} s looks like static gain; move "
+            f"in steps that rest {time_constant:.2g} s or longer (omsm plan steps --dwell)"
+        )
+    return (
+        f"a relaxation of {time_constant:.2g} s does not show on plateaus of {plateau:.2g} s; let "
+        f"the machine settle and rest {time_constant:.2g} s on each plateau (omsm plan steps "
+        "--dwell)"
     )
 
 

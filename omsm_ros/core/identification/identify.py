@@ -27,7 +27,7 @@ from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
 from omsm_ros.core.identification.certificate import certificate_of
-from omsm_ros.core.identification.checks import CHECKS
+from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
 from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
@@ -114,7 +114,9 @@ def identify(
     if model.free is not None:
         known = no_surer(known, prepared, model, model.free, limits)
     evidence = Evidence(record, prepared, model, known, limits, searched, noise)
-    findings = [*known.findings, *(check(evidence) for check in CHECKS)]
+    # What is wrong comes first, then what a right model leaves open, then how far that reaches.
+    wrong = [check(evidence) for check in CHECKS]
+    findings = [*wrong, *known.findings, *(check(evidence) for check in RANGE_CHECKS)]
     best = model.chosen.fit
     calibration = Calibration(
         dynamics=best.dynamics,

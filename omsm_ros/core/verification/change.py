@@ -74,7 +74,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
     p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
-    sigma = math.hypot(*(c.low_frequency_delay_uncertainty for c in (old, new)))
+    sigma = math.hypot(*(c.low_frequency_delay_noise for c in (old, new)))
     worst = int(np.argmax(np.abs(ratio)))
     return Change(
         delay=float(delay),
@@ -99,9 +99,13 @@ def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
 
 
 def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArray:
-    """Of relative gain, then phase [rad], at ``lines`` (k,) [Hz]; shape (2k, 2k)."""
+    """Of relative gain, then phase [rad], at ``lines`` (k,) [Hz]; shape (2k, 2k).
+
+    That of the noise: what could hide in a step test hides in each of one machine alike, and
+    does not tell two of them apart.
+    """
     jacobian = relative_response_jacobian(calibration.dynamics, lines).reshape(2 * len(lines), -1)
-    return np.asarray(jacobian @ calibration.covariance @ jacobian.T)
+    return np.asarray(jacobian @ calibration.noise_covariance @ jacobian.T)
 
 
 def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, int]:

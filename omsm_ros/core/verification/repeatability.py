@@ -90,7 +90,7 @@ def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
     deviation, stated = np.std(off, axis=0, ddof=1), np.sqrt(np.diag(covariance))
     delay = _spread(
         [c.dynamics.low_frequency_delay for c in calibrations],
-        [c.low_frequency_delay_uncertainty for c in calibrations],
+        [c.low_frequency_delay_noise for c in calibrations],
     )
     static_gain = _spread(
         [c.static_gain for c in calibrations],

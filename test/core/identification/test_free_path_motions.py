@@ -42,12 +42,18 @@ def identified(motion, plant, part, seed):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, part, reaches, seed):
     calibration = identified(motion, plant, part, seed)
-    assert 0.9 * reaches < calibration.valid_up_to < 1.3 * reaches
-    assert calibration.certificate["verdict"].startswith("accepted up to")
-    frequency = np.geomspace(0.5, calibration.valid_up_to, 20)
+    assert calibration.valid_up_to < 1.3 * reaches
+    if calibration.certificate["verdict"] == "rejected":
+        # A motion cut out of full swing, or without a slow part, does not tell creep from gain.
+        assert "drift or creep" in calibration.certificate["reasons"][0]
+        assert part == FROM_THE_MIDDLE or isinstance(motion, Multisine)
+    elif isinstance(motion, Chirp):
+        assert calibration.valid_up_to > 0.9 * reaches
+    frequency = np.geomspace(0.5, reaches, 20)
     found, truth = (g.response(frequency) for g in (calibration.dynamics, plant.dynamics))
     error = np.log(found / truth)
-    band = response_band(calibration.dynamics, calibration.covariance, frequency)
+    # What repeated tests scatter by, without what could hide in each: the narrower band.
+    band = response_band(calibration.dynamics, calibration.noise_covariance, frequency)
     assert np.max(np.abs(error.real) / band.gain) < 3.5
     assert np.max(np.abs(error.imag) / band.phase) < 3.5
 
@@ -65,7 +71,8 @@ def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
 def test_a_second_frequency_tells_them_apart():
     sines = Multisine(frequencies=(2.0, 9.0), amplitude=15e-6)
     calibration = identified(sines, LIGHT_MODE, WHOLE, 1)
-    assert calibration.certificate["verdict"].startswith("accepted")
+    # Of 20 s without a rest, drift and creep may still be part of the gain.
+    assert all("drift or creep" in reason for reason in first_reasons(calibration))
     assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
 
@@ -84,6 +91,11 @@ def test_too_little_left_between_the_ends_is_said(lost):
     distance[lost] = np.nan
     with pytest.raises(StepTestError, match="are left to compare"):
         identify(MotionRecord.from_arrays(1e-3, z, distance))
+
+
+def first_reasons(calibration):
+    """The first reason against it, if there is any."""
+    return calibration.certificate["reasons"][:1]
 
 
 def refusal(record):

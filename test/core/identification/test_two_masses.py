@@ -101,7 +101,7 @@ def test_stated_uncertainty_and_misfit_are_those_of_repeated_fits():
     numerator[: len(centre.numerator)] = centre.numerator
     truth = TransferFunction(numerator, centre.denominator)
     # Small, for the statement is linear: a hundredth of the real uncertainty.
-    covariance = 1e-4 * found.covariance
+    covariance = 1e-4 * found.noise_covariance
     values, vectors = np.linalg.eigh(covariance)
     root, rng = vectors * np.sqrt(np.maximum(values, 0.0)), np.random.default_rng(4)
     fits = []
