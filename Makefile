@@ -23,9 +23,10 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE))
 
-# One after the other; `make test JOBS=2` on an idle machine, see test/conftest.py.
+# Two processes, the nodes in one of them (see test/conftest.py); JOBS=0 for one after the other.
+JOBS ?= 2
 test: lint
-	$(RUN) python -m pytest $(if $(JOBS),--numprocesses $(JOBS) --dist loadgroup)
+	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadgroup
 
 lint: setup
 	$(RUN) ruff check .

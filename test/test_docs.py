@@ -18,7 +18,8 @@ def named(page):
         if "://" not in target:
             yield page.parent / target
     for name in re.findall(r"`([\w./]+\.(?:py|yaml|md))`", text):
-        if "/" in name:
+        # A file that a page adds as it goes along stands there as a block of code.
+        if "/" in name and f": `{name}`" not in text:
             yield next(
                 (b / name for b in (ROOT, ROOT / "omsm_ros") if (b / name).exists()), Path(name)
             )
