@@ -31,6 +31,7 @@ from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
 from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.hidden_terms import hidden_covariance
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
@@ -114,9 +115,7 @@ def identify(
     if model.free is not None:
         known = no_surer(known, prepared, model, model.free, limits)
     evidence = Evidence(record, prepared, model, known, limits, searched, noise)
-    # What is wrong comes first, then what a right model leaves open, then how far that reaches.
-    wrong = [check(evidence) for check in CHECKS]
-    findings = [*wrong, *known.findings, *(check(evidence) for check in RANGE_CHECKS)]
+    findings = _findings(evidence)
     best = model.chosen.fit
     calibration = Calibration(
         dynamics=best.dynamics,
@@ -128,3 +127,9 @@ def identify(
         certificate={"input": input} | certificate_of(evidence, findings, mass),
     )
     return Identification(calibration, prepared, best)
+
+
+def _findings(evidence: Evidence) -> list[Finding]:
+    """What is wrong, then what a right model leaves open, then how far that reaches."""
+    wrong, range_ = ([check(evidence) for check in part] for part in (CHECKS, RANGE_CHECKS))
+    return [*wrong, *evidence.known.findings, *range_]
