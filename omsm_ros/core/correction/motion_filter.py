@@ -7,12 +7,13 @@ no number. The samples in which a wrong start would still be felt are marked as 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
 
-from omsm_ros.core.correction.uncertainty import derivative_filter, sensitivity_filters
+from omsm_ros.core.correction.uncertainty import derivative_filter, past_of, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
@@ -37,6 +38,7 @@ class MotionFilters:
     timing: on z, H(z) per unit standard uncertainty of the sideways lag
     lateral: on x, y, b, c, where the lag is latency; None where it is not
     forgotten: samples after which the poles of G have forgotten a wrong start
+    past: what the filters of ``dynamics`` take for the past of their first samples
     """
 
     height: DigitalFilter
@@ -44,6 +46,7 @@ class MotionFilters:
     timing: DigitalFilter | None
     lateral: DigitalFilter | None
     forgotten: int = 2**31
+    past: Callable[[FloatArray], FloatArray] = past_motion
 
     @classmethod
     def of(
@@ -67,6 +70,7 @@ class MotionFilters:
             timing=timing,
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
             forgotten=forgotten_after(g, sample_period),
+            past=past_of(calibration),
         )
 
     def settling_samples(self) -> int:
@@ -108,6 +112,7 @@ class MotionFilter:
     def __init__(self, filters: MotionFilters) -> None:
         self._height = Recursion(filters.height)
         self._dynamics = [Recursion(f) for f in filters.dynamics]
+        self._past = filters.past
         self._timing = Recursion(filters.timing) if filters.timing else None
         self._lateral = (
             {axis: Recursion(filters.lateral) for axis in _LATERAL} if filters.lateral else {}
@@ -162,8 +167,10 @@ class MotionFilter:
 
     def _start(self, first: FloatArray) -> None:
         motion = past_motion(first[_Z].copy())
-        for recursion in (self._height, *self._dynamics, *filter(None, [self._timing])):
+        for recursion in (self._height, *filter(None, [self._timing])):
             recursion.start(motion)
+        for recursion in self._dynamics:
+            recursion.start(self._past(first[_Z].copy()))
         for axis, recursion in self._lateral.items():
             recursion.start(past_motion(first[axis].copy()))
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.uncertainty import ErrorSources, sensitivity_filters
+from omsm_ros.core.correction.uncertainty import ErrorSources, past_of, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
 from omsm_ros.core.dynamics.discretisation_error import (
@@ -37,6 +37,9 @@ from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import NANOMETRE_M
 
 DEFAULT_BUDGET_M = 50 * NANOMETRE_M
+DYNAMICS = "dynamics"
+"""Name of the limit that the calibration itself sets."""
+
 _START_SAMPLES = 12
 # The speed is sought on the worst stretches of the path and proved on the whole of it.
 _STRETCH_SAMPLES = 8192
@@ -129,7 +132,9 @@ def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: f
     """
     variance = np.full(len(z), ErrorSources.of(calibration).motion_error ** 2)
     for digital in sensitivity_filters(calibration, sample_period):
-        variance += _through(digital, z) ** 2
+        recursion = Recursion(digital)
+        recursion.start(past_of(calibration)(z[:_START_SAMPLES]))
+        variance += recursion.run(z) ** 2
     digital = discretise(calibration.dynamics, sample_period)
     variance += _missed_beyond(calibration.valid_up_to, digital, z)
     settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(variance) // 4)
@@ -209,7 +214,7 @@ def _dynamics_limit(
         # A path of which a stretch is within the budget need not be so as a whole.
         whole = float(np.max(residual_over_time(calibration, z, period / factor)))
         factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
-    return SpeedLimit("dynamics", residual, allowed, "m", float(factor)), residual
+    return SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor)), residual
 
 
 def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
@@ -246,6 +251,11 @@ def _message(
         advice = f"it may be run {FASTEST:g} times as fast, further was not tried"
     elif factor >= 1:
         advice = f"it may be run up to {factor:.3g} times as fast; then {binding.name} binds"
+    elif binding.name == DYNAMICS:
+        advice = (
+            "calibrate better (longer plateaus and more steps, omsm plan steps), or run it at "
+            f"{factor:.3g} times this speed"
+        )
     else:
         advice = f"run it at {factor:.3g} times this speed or slower: {binding.name} binds"
     return (

@@ -8,7 +8,7 @@ path; where Z follows the surface that costs ``δ dH(z)/dt`` of height.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discretise
 from omsm_ros.core.dynamics.latency import latency_of
+from omsm_ros.core.dynamics.recursion import past_motion, past_rest
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
@@ -175,6 +176,11 @@ def at_rest_until(calibration: Calibration) -> float:
     """
     lowest = _standard_uncertainty(calibration.certificate, "valid_from")
     return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
+
+
+def past_of(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
+    """Return what the sensitivity filters take for the past of their first samples (k,)."""
+    return past_rest if at_rest_until(calibration) > 0 else past_motion
 
 
 def derivative_filter(

@@ -40,6 +40,15 @@ def past_motion(first: FloatArray) -> FloatArray:
     return shifted
 
 
+def past_rest(first: FloatArray) -> FloatArray:
+    """Return the coefficient (1,) of a rest where :func:`past_motion` has its first sample.
+
+    For a filter that remembers a minute: a parabola through some samples is, so far back,
+    metres of travel.
+    """
+    return past_motion(first)[:1]
+
+
 class Recursion:
     """A digital filter with its state; ``run`` may cut the stream anywhere."""
 

@@ -1,0 +1,57 @@
+"""A gain that is open above a hundredth of a hertz costs its share of the travel, not more."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.predict import residual_over_time
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+
+PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015
+AMPLITUDE = 0.5e-3
+TIME = np.arange(120_000) * PERIOD
+# The lag is mechanical: no term of its own here.
+OPTIONS = CorrectionOptions(lateral_lag=0.0, sources=ErrorSources())
+
+
+def calibration() -> Calibration:
+    covariance = np.zeros((3, 3))
+    covariance[0, 0] = OPEN**2
+    return Calibration(
+        dynamics=TransferFunction(np.ones(1), np.array([1.0, 3e-4])),
+        static_gain=1.0,
+        sample_period=PERIOD,
+        valid_up_to=60.0,
+        covariance=covariance,
+        certificate={"verdict": "accepted", "valid_from": VALID_FROM},
+    )
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, 2.5, 4.0])
+def test_uncertainty_of_a_sine_is_the_open_share_of_its_swing(phase):
+    """Whatever the speed and curvature at the first sample."""
+    z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME + phase)
+    # In blocks, for a queue of minutes is not kept.
+    corrector, found = Corrector(calibration(), OPTIONS), []
+    for first in range(0, len(z), 5000):
+        part = z[first : first + 5000]
+        zero = np.zeros(len(part))
+        place = {"stamp_ns": first * 10**6, "first_sample": first, "sample_period": PERIOD}
+        corrector.push_axes(AxisBlock(**place, x=zero, y=zero, z=part, b=zero, c=zero))
+        corrector.push_distance(DistanceBlock(**place, distance=-part))
+        found.append(corrector.take())
+    found.append(corrector.finish())
+    uncertainty = np.concatenate([points.uncertainty for points in found if points is not None])
+    # The swing about its mean, once the start is forgotten.
+    assert np.max(uncertainty[-10_000:]) == pytest.approx(OPEN * AMPLITUDE, rel=0.02)
+    # Before that the mean is not known; the travel since the first sample is its bound.
+    assert np.max(uncertainty) <= OPEN * 2 * AMPLITUDE * 1.01
+
+
+def test_the_prediction_says_the_same():
+    z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
+    residual = residual_over_time(calibration(), z, PERIOD)
+    assert np.max(residual[-10_000:]) == pytest.approx(OPEN * AMPLITUDE, rel=0.02)
