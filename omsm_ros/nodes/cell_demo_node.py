@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +29,7 @@ from omsm_ros.errors import DeviceTimeoutError, OmsmError
 from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
 
+_DISCOVERY_S = 0.3
 _SERVICE_TIMEOUT_S = 60.0
 _STALL_TIMEOUT_S = 60.0
 _PREFIX = "/omsm/"
@@ -79,6 +81,9 @@ class DemoNode(Node):
         try:
             if not client.wait_for_service(patience):
                 raise DeviceTimeoutError(f"service {name!r} did not appear; see the logs")
+            # The server may see the request before it sees who wants the answer, and then drops it.
+            rclpy.spin_once(self, timeout_sec=_DISCOVERY_S)
+            time.sleep(_DISCOVERY_S)
             future = client.call_async(request)
             rclpy.spin_until_future_complete(self, future, timeout_sec=patience)
             if (answer := future.result()) is None:
