@@ -28,7 +28,22 @@ WORDS = {
     "omsm_ros.cli.aligning": ("align",),
     "omsm_ros.cli.identifying": ("identify",),
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
+    "omsm_ros.cli.starting": ("doctor",),
 }
+
+
+_WHAT_NEXT = """\
+omsm: measure optics on the machine that cut them, the dynamic error corrected.
+
+  is this computer ready?       omsm doctor
+  see it all on a twin          omsm demo --out out/demo
+  on a machine, plan a test     omsm plan steps --out plan/
+  what is in a recording?       omsm inspect steps.mcap
+  identify the dynamics         omsm identify steps.mcap --out cal.json --report certificate/
+  how fast may a scan be?       omsm predict scan.csv --calibration cal.json
+  correct a scan                omsm correct scan.mcap --calibration cal.json --out result/
+
+'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
 
 
 def _commands(word: str) -> list[Command]:
@@ -74,6 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
+    if not given:
+        print(_WHAT_NEXT)
+        return DONE
     try:
         return _run(_parser(given[0] if given else "").parse_args(given))
     except OmsmError as err:

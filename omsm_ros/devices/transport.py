@@ -11,6 +11,7 @@ import termios
 from typing import Protocol
 
 import serial
+from serial.tools import list_ports
 
 from omsm_ros.errors import ConfigurationError, DeviceError
 
@@ -187,3 +188,8 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
             )
         return SerialTransport(path, int(value) if value else baud_rate)
     return SerialTransport(address, baud_rate)
+
+
+def serial_ports() -> list[str]:
+    """Return the paths of this computer's serial ports, in order."""
+    return sorted(port.device for port in list_ports.comports())

@@ -1,0 +1,25 @@
+import json
+
+from omsm_ros import cli
+from omsm_ros.cli import starting
+from omsm_ros.jobs.examine_host import Check
+
+
+def test_omsm_alone_tells_what_to_do_next(capsys):
+    assert cli.main([]) == 0
+    told = capsys.readouterr().out
+    words = [line.split("omsm ")[1].split()[0] for line in told.splitlines() if "  omsm " in line]
+    assert words == ["doctor", "demo", "plan", "inspect", "identify", "predict", "correct"]
+
+
+def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
+    checks = [Check("disk", "fine", "room"), Check("ROS 2", "faulty", "no omsm_msgs", "build it")]
+    monkeypatch.setattr(starting, "examine_host", lambda folder, port: checks)
+    assert cli.main(["doctor", "--folder", str(tmp_path)]) == 2
+    out, err = capsys.readouterr()
+    assert "NO  ROS 2" in out
+    assert "→ build it" in out
+    assert err.strip() == "omsm: not ready: ROS 2; each has its remedy above"
+    assert cli.main(["doctor", "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert [check["state"] for check in told["checks"]] == ["fine", "faulty"]
