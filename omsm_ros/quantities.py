@@ -170,6 +170,12 @@ BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2
 ANGLE_UNCERTAINTY = Quantity(
     "standard uncertainty", "rad", 0.0, 10.0, "give it in radians, k = 1; 10 = not known"
 )
+SLOPE_ERROR = Quantity("standard uncertainty", "m/rad", 0.0, 1.0, "give it in m/rad, k = 1")
+RATE_UNCERTAINTY = Quantity("standard uncertainty", "m/s", 0.0, 1.0, "give it in m/s, k = 1")
+WALK_UNCERTAINTY = Quantity("standard uncertainty", "m/√s", 0.0, 1.0, "give it in m/√s, k = 1")
+PER_TURN = Quantity("waves a turn", "", 1, 10_000, "negative turns against it", True, True)
+PERIOD = Quantity("period", "m", 1e-9, 100.0, "give it in metres")
+CORRELATION_TIME = Quantity("correlation time", "s", 1e-3, 1e7, "give it in seconds")
 LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
 
 STAMP_DELAY = Quantity("delay of the exposure", "s", -10.0, 10.0, "give it in seconds")
