@@ -11,9 +11,9 @@ from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
 from omsm_ros.jobs.study_scans import alignment_of
+from omsm_ros.readable import measured, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.machine_files import save_geometry
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # --------------------------------------------------------------------------------- align
 
@@ -52,12 +52,9 @@ def _show_align(facts: Facts) -> None:
     rows = []
     for name, spread in facts["uncertainty"].items():
         value, length = facts["geometry"][name], name.startswith("centre")
-        unit, text = (MICROMETRE_M, "µm") if length else (1e-3, "mrad")
-        stated = (
-            "not to be seen in this scan" if spread is None else f"± {spread / unit:.4f} {text}"
-        )
-        rows.append((name, f"{value / unit:.4f} {text} {stated}"))
-    rows.append(("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"))
+        stated = measured(value, spread, "m" if length else "rad")
+        rows.append((name, stated if spread is not None else f"{stated}, not seen in this scan"))
+    rows.append(("residual", f"{quantity(facts['residual'], 'm')} rms"))
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
     table([*rows, ("written to", facts["file"])])

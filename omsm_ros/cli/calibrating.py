@@ -17,9 +17,10 @@ from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability
 from omsm_ros.jobs.verify_calibration import path_check_of
+from omsm_ros.readable import quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import save_text
-from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, NANOMETRE_M
+from omsm_ros.units import DEGREE_RAD
 
 # A second height that is no simple part of the first: 3 µm beside 9.8 µm.
 _SECOND_SHARE = 3 / 9.8
@@ -57,16 +58,12 @@ def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
 
 
 def _show_verify(facts: Facts) -> None:
-    print("    Hz   error before   after        lag before   after")
+    print("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
     for band in facts["bands"]:
-        before, after = (band[f"error_{w}"] / NANOMETRE_M for w in ("before", "after"))
-        lags = (band[f"lag_{w}"] / DEGREE_RAD for w in ("before", "after"))
-        print(
-            f"{band['from']:3.0f}-{band['to']:<3.0f} {before:8.1f} nm {after:8.1f} nm "
-            + " ".join(f"{lag:10.4f}°" for lag in lags)
-        )
-    before, after = (facts[f"rms_{w}"] / NANOMETRE_M for w in ("before", "after"))
-    print(f"rms    {before:8.1f} nm {after:8.1f} nm")
+        errors = (quantity(band[f"error_{w}"], "m") for w in ("before", "after"))
+        lags = (quantity(band[f"lag_{w}"] / DEGREE_RAD, "°") for w in ("before", "after"))
+        print(f"{band['from']:3.0f}-{band['to']:<3.0f}", *(f"{x:>12}" for x in (*errors, *lags)))
+    print("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
 
 
 # ------------------------------------------------------------------------------- compare
@@ -106,7 +103,7 @@ def _repeatability_facts(found: Repeatability) -> Facts:
 def _declare_plan(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("what", choices=("steps",))
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    for name, quantity, default, meaning in (
+    for name, kind, default, meaning in (
         ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "of the probe [s]"),
         ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
         (
@@ -120,7 +117,7 @@ def _declare_plan(sub: argparse.ArgumentParser) -> None:
         ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
         ("--half-range", quantities.STEP, 50e-6, "of the probe [m]"),
     ):
-        sub.add_argument(name, type=number(quantity), default=default, help=meaning)
+        sub.add_argument(name, type=number(kind), default=default, help=meaning)
 
 
 def _plan(args: argparse.Namespace) -> Facts:
@@ -146,17 +143,17 @@ def _plan(args: argparse.Namespace) -> Facts:
     }
 
 
-def _micrometres(lengths: Sequence[float]) -> str:
-    return " and ".join(f"{length / MICROMETRE_M:g}" for length in lengths) + " µm"
+def _lengths(lengths: Sequence[float]) -> str:
+    return " and ".join(quantity(length, "m") for length in lengths)
 
 
 def _show_plan(facts: Facts) -> None:
     table(
         [
-            ("edges", f"{facts['edges']} of {_micrometres(facts['heights'])}"),
-            ("travel", _micrometres([facts["travel"]])),
-            ("duration", f"{facts['duration']:g} s"),
-            ("rise", f"{facts['rise'] * 1e3:g} ms, dithered within the sample period"),
+            ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
+            ("travel", _lengths([facts["travel"]])),
+            ("duration", quantity(facts["duration"], "s")),
+            ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
             ("written", ", ".join(facts["files"].values())),
         ]
     )

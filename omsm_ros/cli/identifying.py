@@ -15,9 +15,9 @@ from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.identify_table import model_of_motion, model_of_table
+from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.model_file import save_model
-from omsm_ros.units import MICROSECOND_S
 
 TABLE_SUFFIX = ".csv"
 
@@ -158,15 +158,18 @@ def _show(facts: Facts) -> None:
     if "model" in facts:
         rows += [
             ("hold", facts["hold"]),
-            ("accounts for", f"{facts['explained']:.2%} of what was fitted"),
-            ("free runs", f"{facts['predicted']:.2%} of what was hidden"),
-            ("valid", f"{facts['valid_from']:.3g} to {facts['valid_up_to']:.3g} Hz"),
+            ("accounts for", f"{percent(facts['explained'], 4)} of what was fitted"),
+            ("free runs", f"{percent(facts['predicted'], 4)} of what was hidden"),
+            (
+                "valid",
+                " to ".join(quantity(facts[f"valid_{end}"], "Hz") for end in ("from", "up_to")),
+            ),
         ]
     else:
         rows += [
-            ("low-frequency delay", f"{facts['low_frequency_delay'] / MICROSECOND_S:.2f} µs"),
-            ("static gain", f"{facts['static_gain']:.6f}"),
-            ("valid up to", f"{facts['valid_up_to']:.1f} Hz"),
+            ("low-frequency delay", quantity(facts["low_frequency_delay"], "s", 5)),
+            ("static gain", plain(facts["static_gain"], 6)),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz", 4)),
         ]
     for kind in ("reasons", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts[kind]]

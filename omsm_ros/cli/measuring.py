@@ -20,12 +20,12 @@ from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.read_bag import path_in
+from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
 from omsm_ros.storage.machine_files import load_geometry, load_limits, load_surface
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
@@ -176,11 +176,11 @@ def _show_predict(facts: Facts) -> None:
     table(
         [
             ("verdict", "safe" if facts["safe"] else "NOT safe"),
-            ("dynamic error", f"{facts['peak_to_valley'] / MICROMETRE_M:.3f} µm PV, "
-                              f"{facts['rms'] / MICROMETRE_M:.3f} µm rms"),
-            ("left after correction", f"{facts['residual'] / NANOMETRE_M:.2f} nm (k = 1)"),
-            ("motion outside the band", f"{100 * facts['outside_band_fraction']:.2g} %"),
-            ("may run faster by", f"{facts['speed_factor']:.3g}, bound by {facts['binding']}"),
+            ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
+                              f"{quantity(facts['rms'], 'm', 4)} rms"),
+            ("left after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
+            ("motion outside the band", percent(facts["outside_band_fraction"])),
+            ("may run faster by", f"{plain(facts['speed_factor'])}, bound by {facts['binding']}"),
             *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
             ("because", facts["message"]),
@@ -190,7 +190,8 @@ def _show_predict(facts: Facts) -> None:
 
 def _limit_text(limit: Mapping[str, Any]) -> str:
     value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
-    return f"{value:.3g} of {allowed:.3g} {unit}, {limit['speed_factor']:.3g} times as fast"
+    faster = plain(limit["speed_factor"])
+    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, {faster} times as fast"
 
 
 COMMANDS = (

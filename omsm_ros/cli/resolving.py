@@ -23,8 +23,9 @@ from omsm_ros.jobs.study_scans import (
     self_calibration_of,
     sideways_lag_of,
 )
+from omsm_ros.readable import measured, percent, quantity
 from omsm_ros.storage.calibration_file import load_calibration, save_calibration
-from omsm_ros.units import MICROSECOND_S, NANOMETRE_M, RPM_RAD_S
+from omsm_ros.units import RPM_RAD_S
 
 # ------------------------------------------------------------------------------- selfcal
 
@@ -117,10 +118,9 @@ def _show_selfcal(facts: Facts) -> None:
             ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
             ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
             *_latency_rows(facts["latency"]),
-            ("valid up to", f"{facts['valid_up_to']:.1f} Hz"),
-            ("left on this surface", f"{facts['left_on_this_surface'] / NANOMETRE_M:.2f} nm "
-                                     "rms (k = 1)"),
-            ("scans differ by", f"{facts['disagreement'] / NANOMETRE_M:.2f} nm rms beyond noise"),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+            ("left on this surface", f"{quantity(facts['left_on_this_surface'], 'm')} rms (k = 1)"),
+            ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
             *(("not told", text) for text in facts["not_told"]),
             ("written to", facts["calibration"]),
         ]
@@ -128,15 +128,15 @@ def _show_selfcal(facts: Facts) -> None:
 
 
 def _time(seconds: float, spread: float | None) -> str:
-    known = "unknown" if spread is None else f"{spread / MICROSECOND_S:.2f} µs (k = 1)"
-    return f"{seconds / MICROSECOND_S:.2f} µs ± {known}"
+    stated = measured(seconds, spread, "s")
+    return f"{stated} ± unknown" if spread is None else f"{stated} (k = 1)"
 
 
 def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
     share = latency["share"]
     return [
         ("of it latency", _time(latency["delay_s"], latency["uncertainty_s"])),
-        ("share", "not known" if share is None else f"{share:.3f}"),
+        ("share", "not known" if share is None else percent(share, 3)),
         ("by", f"{latency['source']}: {latency['reason']}"),
     ]
 
@@ -178,9 +178,9 @@ def _show_reversal(facts: Facts) -> None:
     table(
         [
             ("sideways lag", _time(facts["lag"], facts["uncertainty"])),
-            ("lag of Z", f"{facts['lag_of_z'] / MICROSECOND_S:.2f} µs"),
+            ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
             ("meaning", _MEANINGS[facts["latency"]]),
-            ("residual", f"{facts['residual'] / NANOMETRE_M:.1f} nm rms"),
+            ("residual", f"{quantity(facts['residual'], 'm')} rms"),
             ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
             ("written to", facts.get("calibration", "nowhere; give --out to use it")),
         ]

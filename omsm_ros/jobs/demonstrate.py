@@ -24,6 +24,7 @@ from omsm_ros.errors import OmsmError
 from omsm_ros.jobs import measure as measurement
 from omsm_ros.jobs import publish as publication
 from omsm_ros.jobs.correct_bag import correct_bag
+from omsm_ros.readable import quantity
 from omsm_ros.report.common import response_figures, style
 from omsm_ros.report.measurement.cloud_view import CloudView
 from omsm_ros.report.measurement.figures import overview_figure
@@ -38,7 +39,7 @@ from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, scan_of, spiral_of, step_test_of
 from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.truth import TruthComparison, departure_from_truth
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
+from omsm_ros.units import PPM
 
 # The step test begins at rest.
 _REST_SAMPLES = 100
@@ -268,21 +269,22 @@ def _sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
     before, after = summary["dynamic_error_before"], summary["dynamic_error_after"]
-    yield "dynamic error before", _spread(before, MICROMETRE_M, "µm")
-    yield "  after correction", _spread(after, NANOMETRE_M, "nm")
+    yield "dynamic error before", _spread(before)
+    yield "  after correction", _spread(after)
     surface = summary["surface_deviation"]
-    floor = surface["probe_noise_and_resolution"] / NANOMETRE_M
+    floor = quantity(surface["probe_noise_and_resolution"], "m")
     yield (
         "cloud from true surface",
-        f"rms {surface['rms'] / NANOMETRE_M:.2f} nm; the probe alone has {floor:.2f} nm",
+        f"rms {quantity(surface['rms'], 'm')}; the probe alone has {floor}",
     )
     for row in summary["response"]:
         yield (
-            f"G at {row['frequency']:g} Hz, off by",
-            f"{row['gain_error'] / PPM:+.2f} ppm, {row['phase_error_deg']:+.5f}°",
+            f"G at {quantity(row['frequency'], 'Hz')}, off by",
+            f"{quantity(row['gain_error'] / PPM, 'ppm', signed=True)}, "
+            f"{quantity(row['phase_error_deg'], '°', signed=True)}",
         )
 
 
-def _spread(spread: dict[str, float], unit: float, name: str) -> str:
-    pv, rms = spread["peak_to_valley"] / unit, spread["rms"] / unit
-    return f"{pv:.3f} {name} PV, {rms:.3f} {name} rms (by area)"
+def _spread(spread: dict[str, float]) -> str:
+    pv, rms = quantity(spread["peak_to_valley"], "m"), quantity(spread["rms"], "m")
+    return f"{pv} PV, {rms} rms (by area)"

@@ -34,6 +34,7 @@ from omsm_ros.core.machine.limits import (
 )
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.readable import plain, quantity
 from omsm_ros.units import NANOMETRE_M
 
 DEFAULT_BUDGET_M = 50 * NANOMETRE_M
@@ -250,17 +251,17 @@ def _message(
     elif factor >= FASTEST:
         advice = f"it may be run {FASTEST:g} times as fast, further was not tried"
     elif factor >= 1:
-        advice = f"it may be run up to {factor:.3g} times as fast; then {binding.name} binds"
+        advice = f"it may be run up to {plain(factor)} times as fast; then {binding.name} binds"
     elif binding.name == DYNAMICS:
         advice = (
             "calibrate better (longer plateaus and more steps, omsm plan steps), or run it at "
-            f"{factor:.3g} times this speed"
+            f"{plain(factor)} times this speed"
         )
     else:
-        advice = f"run it at {factor:.3g} times this speed or slower: {binding.name} binds"
+        advice = f"run it at {plain(factor)} times this speed or slower: {binding.name} binds"
     return (
-        f"dynamic error {peak_to_valley / NANOMETRE_M:.0f} nm peak to valley; corrected within "
-        f"{2 * residual / NANOMETRE_M:.1f} nm (k = 2, largest on the path), {verdict} the budget "
-        f"of {budget / NANOMETRE_M:.1f} nm; {advice} (trusted up to "
-        f"{calibration.valid_up_to:.3g} Hz)"
+        f"dynamic error {quantity(peak_to_valley, 'm')} peak to valley; corrected within "
+        f"{quantity(2 * residual, 'm')} (k = 2, largest on the path), {verdict} the budget "
+        f"of {quantity(budget, 'm')}; {advice} (trusted up to "
+        f"{quantity(calibration.valid_up_to, 'Hz')})"
     )

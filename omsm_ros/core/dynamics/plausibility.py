@@ -15,6 +15,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunct
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
 from omsm_ros.quantities import DELAY, ORDER, SAMPLE_PERIOD, TIME_CONSTANT, shown
+from omsm_ros.readable import plain, quantity
 
 # G_m(0) = 1 by definition; rounding of the coefficients leaves far less than this.
 _UNIT_GAIN = 1e-6
@@ -101,8 +102,9 @@ def _inverse(rate: float) -> float:
 def _check_samples(name: str, seconds: float, sample_period: float, most: int) -> None:
     if seconds > most * sample_period:
         raise CalibrationError(
-            f"{name} of G_m is {seconds:.4g} s, {seconds / sample_period:.3g} samples of "
-            f"{sample_period:.4g} s; expected at most {most}; identify it again"
+            f"{name} of G_m is {quantity(seconds, 's', 4)}: {plain(seconds / sample_period)} "
+            f"samples of {quantity(sample_period, 's', 4)}, expected at most {most}; "
+            "identify it again"
         )
 
 
@@ -127,6 +129,6 @@ def _check_size(deviation: FloatArray, dynamics: TransferFunction, trusted: floa
         at_end = deviation * omega ** np.array(powers, np.float64)
     if np.any(~(at_end <= _MAX_UNCERTAINTY)):
         raise CalibrationError(
-            f"covariance leaves the response at {trusted:.4g} Hz uncertain by a factor of "
-            f"{float(np.max(at_end)):.2g}; identify it again"
+            f"covariance leaves the response at {quantity(trusted, 'Hz', 4)} uncertain by a factor "
+            f"of {plain(float(np.max(at_end)), 2)}; identify it again"
         )

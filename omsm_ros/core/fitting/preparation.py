@@ -23,7 +23,7 @@ from omsm_ros.core.fitting.steps import (
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
-from omsm_ros.units import MICROMETRE_M
+from omsm_ros.readable import quantity
 
 # What happened before the record is forgotten after this time.
 _SETTLING_S = 50e-3
@@ -178,7 +178,7 @@ def _check_not_clipped(problem: Problem) -> None:
         if len(there) >= 5 and np.ptp(there) > allowed:
             raise IdentificationError(
                 f"the probe gives its {name} distance {len(there)} times while the axis moves by "
-                f"{float(np.ptp(there)) / MICROMETRE_M:.3g} µm: it is clipped; "
+                f"{quantity(float(np.ptp(there)), 'm')}: it is clipped; "
                 "centre it in its range"
             )
 

@@ -20,6 +20,7 @@ from omsm_ros.core.identification.static_gains import static_gains
 from omsm_ros.core.identification.two_masses import two_mass_entry
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
+from omsm_ros.readable import quantity
 
 
 def certificate_of(
@@ -63,7 +64,8 @@ def verdict(
     if reasons:
         return "rejected"
     kept = "accepted with reservations" if reservations else "accepted"
-    return f"{kept}, supported by data from {valid_from:.2g} to {valid_up_to:.0f} Hz"
+    low, high = quantity(valid_from, "Hz", 2), quantity(valid_up_to, "Hz")
+    return f"{kept}, supported by data from {low} to {high}"
 
 
 def _order_entries(model: Model) -> dict[str, object]:

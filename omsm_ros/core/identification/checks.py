@@ -15,6 +15,7 @@ from omsm_ros.core.fitting.covariance import gain_uncertainty_alone
 from omsm_ros.core.identification.departure_checks import agreement, departures, independence
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
+from omsm_ros.readable import percent, plain, quantity
 
 # A residual this much larger than the noise is not noise; its square is χ² per sample.
 _WORST_CHI_SQUARE = 1.3
@@ -32,14 +33,14 @@ def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Findi
     reasons = []
     if chi_square > _WORST_CHI_SQUARE:
         reasons.append(
-            f"where the axis moves the residual is {chi_square:.2f} times the noise of "
-            f"{noise * 1e9:.3g} nm squared: the model misses something; "
+            f"where the axis moves the residual is {plain(chi_square)} times the noise of "
+            f"{quantity(noise, 'm')} squared: the model misses something; "
             + _what_to_check(clearly_better)
         )
     if chi_square < _LEAST_CHI_SQUARE:
         reasons.append(
-            f"where the axis moves the residual is only {chi_square:.2g} times the noise "
-            f"of {noise * 1e9:.3g} nm squared: the probe is not quiet where the axis "
+            f"where the axis moves the residual is only {plain(chi_square, 2)} times the noise "
+            f"of {quantity(noise, 'm')} squared: the probe is not quiet where the axis "
             "rests, or the stated noise is too large; start the recording after a second of rest"
         )
     limits = {"chi_square_least": _LEAST_CHI_SQUARE, "chi_square_greatest": _WORST_CHI_SQUARE}
@@ -63,7 +64,7 @@ def separable_gain(uncertainty: float, limit: float) -> Finding:
     return Finding(
         reasons=(
             "the motion does not tell the static gain from the dynamics (its gain alone is "
-            f"uncertain by {100 * COVERAGE_FACTOR * uncertainty:.2g} %): move in steps, or "
+            f"uncertain by {percent(COVERAGE_FACTOR * uncertainty)}): move in steps, or "
             "at several frequencies at once",
         )
     )
@@ -79,7 +80,7 @@ def trusted_range(valid_up_to: float, limits: ResponseLimits) -> Finding:
     reasons: tuple[str, ...] = ()
     if valid_up_to < _LEAST_TRUSTED_HZ:
         reasons = (
-            f"the response is known within limits only up to {valid_up_to:.2g} Hz; "
+            f"the response is known within limits only up to {quantity(valid_up_to, 'Hz', 2)}; "
             "make more or larger steps",
         )
     return Finding(limits=allowed, reasons=reasons)
@@ -92,7 +93,7 @@ def requested_order(order: int, factor: float) -> Finding:
     return Finding(
         warnings=(
             f"order {order} was asked for; without asking, more stays open than it can state: "
-            f"its uncertainties are taken {factor:.2g} times as large",
+            f"its uncertainties are taken {plain(factor, 2)} times as large",
         )
     )
 
@@ -104,7 +105,7 @@ def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float)
     """
     return Finding(
         warnings=tuple(
-            f"pole at {mode.frequency:.0f} Hz lies beyond {valid_up_to:.0f} Hz, "
+            f"pole at {quantity(mode.frequency, 'Hz')} lies beyond {quantity(valid_up_to, 'Hz')}, "
             "up to which the response is known within limits: it need not be a resonance"
             for mode in dynamics.modes()
             if valid_up_to < mode.frequency < 10 * nyquist

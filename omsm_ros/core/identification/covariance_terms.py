@@ -21,6 +21,7 @@ from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.inter_sample_bias import inter_sample_delay_bound
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.readable import quantity
 
 # Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms). The band holds all of it.
 _HARMLESS_DELAY_S = 7e-6
@@ -57,7 +58,7 @@ def hidden_motion_finding(bound: float, delay_noise: float) -> Finding:
     reasons: tuple[str, ...] = ()
     if bound > max(delay_noise, _HARMLESS_DELAY_S):
         reasons = (
-            f"motion between samples may shift the lag by {bound * 1e6:.1f} µs: the edges are "
+            f"motion between samples may shift the lag by {quantity(bound, 's')}: the edges are "
             "too sharp for the sampling; use jerk-limited or dithered edges, or sample faster",
         )
     return Finding({"inter_sample_delay_bound_s": bound}, reasons=reasons)
@@ -86,8 +87,8 @@ def reference_finding(lag: ReferenceLag) -> Finding:
         entries,
         {"reference_lag_greatest_s": _GREATEST_REFERENCE_LAG_S},
         reasons=(
-            f"the reference sensor is {abs(lag.value) * 1e6:.3g} µs {word} against the encoder "
-            f"(u = {lag.uncertainty * 1e6:.1g} µs), and a correction filters the encoder: "
+            f"the reference sensor is {quantity(abs(lag.value), 's')} {word} against the encoder "
+            f"(u = {quantity(lag.uncertainty, 's', 2)}), and a correction filters the encoder: "
             "identify with input 'encoder', or remove the filter or averaging of the reference",
         ),
     )

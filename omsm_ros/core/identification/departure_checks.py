@@ -29,7 +29,7 @@ from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.identification.departure_search import ModelledTerm, Searched
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.residual_tests import response_agreement
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
+from omsm_ros.readable import chance, plain, quantity
 
 # No benign one of a hundred test records (noise, hum, drift, dropouts) comes above it.
 _WORST_AGREEMENT = 2.5
@@ -124,28 +124,30 @@ def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[t
 
 
 def _words(term: Term, size: float | None) -> str:
-    nanometres = "" if size is None else f" of {size / NANOMETRE_M:.3g} nm"
+    large = "" if size is None else f" of {quantity(size, 'm')}"
+    half = quantity(size or 0.0, "m")
+    length = quantity(term.parameter, "m")
+    frequency = quantity(term.parameter, "Hz", 4)
     return {
-        CREEP: f"slow relaxation (creep) with a time constant of {term.parameter:.2g} s",
-        MODE: f"a light mode at {term.parameter:.3g} Hz",
-        BACKLASH: f"backlash of ±{(size or 0.0) / NANOMETRE_M:.3g} nm",
-        FRICTION: f"friction that drags by ±{(size or 0.0) / NANOMETRE_M:.3g} nm and slides "
-        f"after {term.parameter / MICROMETRE_M:.2g} µm",
+        CREEP: "slow relaxation (creep) with a time constant of "
+        + quantity(term.parameter, "s", 2),
+        MODE: f"a light mode at {frequency}",
+        BACKLASH: f"backlash of ±{half}",
+        FRICTION: f"friction that drags by ±{half} and slides after {length}",
         STIFFENING: "a stiffness that grows with the deflection",
-        LINEARITY: f"the probe's scale changes over its range, by{nanometres[3:]} at its ends",
-        PERIODIC: f"an error{nanometres} periodic in "
-        f"{term.parameter / MICROMETRE_M:.3g} µm of travel",
-        VIBRATION: f"vibration{nanometres} at {term.parameter:.4g} Hz",
-        DRIFT: f"drift{nanometres} rms during the test",
+        LINEARITY: f"the probe's scale changes over its range, by{large[3:]} at its ends",
+        PERIODIC: f"an error{large} periodic in {length} of travel",
+        VIBRATION: f"vibration{large} at {frequency}",
+        DRIFT: f"drift{large} rms during the test",
     }[term.family]
 
 
 def _unmodelled(judged: Judged) -> str:
     size = float(np.linalg.norm(judged.score.size))
+    by_chance = chance(float(np.exp(max(judged.log_p, -690))))
     return (
-        f"the residual shows {_words(judged.term, size)} (probability by chance "
-        f"{np.exp(max(judged.log_p, -690)):.1g}) that no model describes: "
-        f"{_REMEDY[judged.term.family]}, and repeat the test"
+        f"the residual shows {_words(judged.term, size)} (by chance: {by_chance}) that no model "
+        f"describes: {_REMEDY[judged.term.family]}, and repeat the test"
     )
 
 
@@ -154,7 +156,7 @@ def independence(p_value: float) -> Finding:
     reasons: tuple[str, ...] = ()
     if p_value < FALSE_ALARM:
         reasons = (
-            f"the residual follows the motion (probability by chance {p_value:.1g}): the machine "
+            f"the residual follows the motion (by chance: {chance(p_value)}): the machine "
             "does not answer linearly, or differently each time; look for what is loose or rubs, "
             "and compare with smaller steps",
         )
@@ -173,8 +175,9 @@ def agreement(problem: Problem, best: Fit, up_to: float) -> Finding:
     reasons: tuple[str, ...] = ()
     if value > _WORST_AGREEMENT:
         reasons = (
-            f"the response estimated without a model differs from the model by {value:.1f} times "
-            f"its variance, at most {_WORST_AGREEMENT:g} are chance: the model misses a part of "
+            "the response estimated without a model differs from the model by "
+            f"{plain(value, 2)} times its variance, at most {_WORST_AGREEMENT:g} are chance: the "
+            "model misses a part of "
             "the machine; make more steps of two heights, and look for what is loose",
         )
     return Finding(

@@ -33,6 +33,7 @@ from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import percent, quantity
 
 # Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
 # area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
@@ -167,26 +168,27 @@ def gain_above_rest(size: float, time_constant: float, plateau: float, limit: fl
     entries = {"gain_above_rest_u": size, "plateau_that_would_tell_s": time_constant}
     if COVERAGE_FACTOR * size <= limit:
         return Finding(entries)
-    wide, allowed = 100 * COVERAGE_FACTOR * size, 100 * limit
+    wide, allowed = percent(COVERAGE_FACTOR * size), percent(limit)
     return Finding(
         entries,
         reasons=(
-            f"drift or creep leaves the gain of what moves open by {wide:.2g} % against that at "
-            f"rest, at most {allowed:.2g} % are allowed: "
+            f"drift or creep leaves the gain of what moves open by {wide} against that at "
+            f"rest, at most {allowed} are allowed: "
             + _plateau_that_would_tell(time_constant, plateau),
         ),
     )
 
 
 def _plateau_that_would_tell(time_constant: float, plateau: float) -> str:
+    slow, rest = quantity(time_constant, "s", 2), quantity(plateau, "s", 2)
     if time_constant <= plateau:
         return (
-            f"in this motion a relaxation of {time_constant:.2g} s looks like static gain; move "
-            f"in steps that rest {time_constant:.2g} s or longer (omsm plan steps --dwell)"
+            f"in this motion a relaxation of {slow} looks like static gain; move "
+            f"in steps that rest {slow} or longer (omsm plan steps --dwell)"
         )
     return (
-        f"a relaxation of {time_constant:.2g} s does not show on plateaus of {plateau:.2g} s; let "
-        f"the machine settle and rest {time_constant:.2g} s on each plateau (omsm plan steps "
+        f"a relaxation of {slow} does not show on plateaus of {rest}; let "
+        f"the machine settle and rest {slow} on each plateau (omsm plan steps "
         "--dwell)"
     )
 
@@ -229,8 +231,8 @@ def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
 def _assumptions(survey: Survey) -> list[str]:
     slowest = survey.slowest_creep
     return [
-        f"no relaxation slower than {slowest:.3g} s, the length of the record",
-        f"no mode below {1 / survey.plateau:.2g} Hz, the rate of the steps",
+        f"no relaxation slower than {quantity(slowest, 's')}, the length of the record",
+        f"no mode below {quantity(1 / survey.plateau, 'Hz', 2)}, the rate of the steps",
     ]
 
 

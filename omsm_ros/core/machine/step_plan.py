@@ -13,6 +13,7 @@ import numpy as np
 from omsm_ros.core.machine.trajectories import AxisPositions, s_curve
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import count, quantity
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M
 
 # The golden ratio's fraction spreads any number of edges evenly over the sample period.
@@ -82,8 +83,8 @@ def plan_steps(
     travel = float(np.sum(upward))
     if travel > 2 * half_range:
         raise ConfigurationError(
-            f"step plan: {count!r} steps travel {travel:.4g} m, which leaves the probe's range of "
-            f"±{half_range!r} m; use fewer or smaller steps"
+            f"step plan: {count!r} steps travel {quantity(travel, 'm')}, which leaves the probe's "
+            f"range of ±{quantity(half_range, 'm')}; use fewer or smaller steps"
         )
     if dwell < 3 * rise:
         raise ConfigurationError(
@@ -107,8 +108,9 @@ def plan_csv(plan: StepPlan, period: float) -> str:
     """
     if plan.duration > _MOST_LINES * period:
         raise ConfigurationError(
-            f"step plan: {plan.duration:g} s every {period:g} s are {plan.duration / period:.3g} "
-            f"lines, at most {_MOST_LINES}; plan fewer steps or shorter rests"
+            f"step plan: {quantity(plan.duration, 's')} every {quantity(period, 's')} are "
+            f"{count(round(plan.duration / period))} lines, at most {_MOST_LINES}; plan fewer "
+            "steps or shorter rests"
         )
     time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
     rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, Band, ResponseLimits
+from omsm_ros.readable import chance, percent, plain, quantity
 
 # A tenth of the gain, and as much of a radian: a model of a process, not of a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
@@ -53,6 +54,7 @@ def sampled_certificate(
     predicted = entries["predicted"]
     assert isinstance(predicted, float)
     reasons = _reasons(predicted, valid, limits)
+    low, high = (quantity(end, "Hz") for end in valid)
     return {
         "order": order,
         "free_order": free_order,
@@ -64,7 +66,7 @@ def sampled_certificate(
         },
         "warnings": _warnings(entries.get("independence_p"), order, free_order, widened),
         "reasons": reasons,
-        "verdict": (REJECTED if reasons else f"accepted from {valid[0]:.3g} to {valid[1]:.3g} Hz"),
+        "verdict": REJECTED if reasons else f"accepted from {low} to {high}",
     }
 
 
@@ -72,14 +74,15 @@ def _reasons(predicted: float, valid: tuple[float, float], limits: ResponseLimit
     reasons = []
     if not predicted >= _LEAST_PREDICTED:
         reasons.append(
-            f"free runs over parts of the record that were hidden account for {predicted:.1%} of "
-            f"the variance there, less than {_LEAST_PREDICTED:.0%}: it describes what was fitted "
-            "only; record longer, or look for a further input or a drift"
+            "free runs over parts of the record that were hidden account for "
+            f"{percent(predicted, 3)} of the variance there, less than "
+            f"{percent(_LEAST_PREDICTED)}: it describes what was fitted only; record longer, or "
+            "look for a further input or a drift"
         )
     if not valid[1] > valid[0]:
         reasons.append(
-            f"the response is known nowhere to {limits.gain:.0%} of gain and {limits.phase:.2g} "
-            "rad; record longer, or excite more"
+            f"the response is known nowhere to {percent(limits.gain, 1)} of gain and "
+            f"{quantity(limits.phase, 'rad', 2)}; record longer, or excite more"
         )
     return reasons
 
@@ -88,12 +91,12 @@ def _warnings(independent: object, order: int, free_order: int, widened: float) 
     warnings = []
     if isinstance(independent, float) and independent < _LEAST_INDEPENDENCE_P:
         warnings.append(
-            f"the residual follows the input (p = {independent:.1g}): more poles, a longer delay, "
+            f"the residual follows the input ({chance(independent)}): more poles, a longer delay, "
             "or something that is not linear"
         )
     if order != free_order:
         warnings.append(
             f"order {order} was asked for, {free_order} would have been chosen: "
-            f"its uncertainties are taken {widened:.2g} times as large"
+            f"its uncertainties are taken {plain(widened, 2)} times as large"
         )
     return warnings

@@ -15,6 +15,7 @@ from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
+from omsm_ros.readable import plain
 
 _SECTORS = 12
 # Three numbers each: 12 MB.
@@ -222,7 +223,7 @@ def _stretches(position: FloatArray, spacing: float) -> IntArray:
     extent = float(np.max(np.abs(position), initial=0.0)) / spacing
     if extent > _MOST_STRETCHES:
         raise DataError(
-            f"spacing {spacing!r} m cuts the profile into {extent:.0f} stretches; widen it"
+            f"spacing {spacing!r} m cuts the profile into {plain(extent)} stretches; widen it"
         )
     return np.asarray(np.floor(position / spacing), np.int64)
 

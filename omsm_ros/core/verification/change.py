@@ -17,6 +17,8 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.response_band import relative_response_jacobian
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
+from omsm_ros.readable import chance, quantity
+from omsm_ros.units import PPM
 
 _LINES = 30
 # One in a thousand comparisons of an unchanged machine calls it changed.
@@ -51,11 +53,12 @@ class Change:
     def text(self) -> str:
         """One line for a reader."""
         if not self.changed:
-            return f"the same (p = {self.p_value:.2g})"
+            return f"the same ({chance(self.p_value)})"
         return (
-            f"changed: lag by {self.delay * 1e6:+.2f} µs ({self.delay_sigmas:.1f} sigma), "
-            f"static gain by {self.static_gain * 1e6:+.0f} ppm "
-            f"({self.static_gain_sigmas:.1f} sigma), p = {self.p_value:.2g}"
+            f"changed: lag by {quantity(self.delay, 's', signed=True)} "
+            f"({self.delay_sigmas:.1f} sigma), static gain by "
+            f"{quantity(self.static_gain / PPM, 'ppm', signed=True)} "
+            f"({self.static_gain_sigmas:.1f} sigma), {chance(self.p_value)}"
         )
 
 

@@ -18,6 +18,7 @@ from omsm_ros.core.verification.change import (
     response_covariance,
 )
 from omsm_ros.errors import CalibrationError
+from omsm_ros.readable import chance, measured, plain
 
 
 @dataclass(frozen=True)
@@ -61,14 +62,14 @@ class Repeatability:
         verdict = "as repeatable as stated" if self.repeatable else "scatter more than they state"
         lag, gain = self.delay, self.static_gain
         return (
-            f"{self.count} calibrations {verdict} (p = {self.p_value:.2g}): "
-            f"lag {lag.mean * 1e6:.2f} µs ± {lag.deviation * 1e6:.2f} µs{_of_stated(lag)}, "
-            f"static gain {gain.mean:.6f} ± {gain.deviation * 1e6:.1f} ppm{_of_stated(gain)}"
+            f"{self.count} calibrations {verdict} ({chance(self.p_value)}): "
+            f"lag {measured(lag.mean, lag.deviation, 's')}{_of_stated(lag)}, "
+            f"static gain {measured(gain.mean, gain.deviation, digits=6)}{_of_stated(gain)}"
         )
 
 
 def _of_stated(spread: Spread) -> str:
-    return f" ({spread.ratio:.2f} of stated)" if spread.stated else ""
+    return f" ({plain(spread.ratio)} of stated)" if spread.stated else ""
 
 
 def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:

@@ -22,7 +22,8 @@ from omsm_ros.core.verification.self_calibration import (
     Prior,
     SelfCalibration,
 )
-from omsm_ros.units import MICROSECOND_S, NANOMETRE_M, RPM_RAD_S
+from omsm_ros.readable import plain, quantity
+from omsm_ros.units import RPM_RAD_S
 
 SCOPE = (
     "identified on a surface that Z follows, where latency leaves no trace: the response is that "
@@ -136,7 +137,7 @@ def from_scans_alone(
         "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
         "warnings": [] if found.known[LATENCY] else [SCOPE],
         "reasons": [],
-        "verdict": f"accepted up to {trusted:.3g} Hz",
+        "verdict": f"accepted up to {quantity(trusted, 'Hz')}",
     }
     return Calibration(
         dynamics=dynamics,
@@ -247,15 +248,15 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
     reasons = []
     if not found.agreement.holds:
         reasons.append(
-            f"the scans contradict each other by {found.agreement.disagreement / NANOMETRE_M:.1f} "
-            f"nm rms, {found.agreement.ratio:.1f} times what noise explains; the part moved, or "
+            f"the scans contradict each other by {quantity(found.agreement.disagreement, 'm')} "
+            f"rms, {plain(found.agreement.ratio, 2)} times what noise explains; the part moved, or "
             "something else than speed changed between them: let the machine settle and repeat"
         )
     if stats.chi2.sf(found.surprise, GAIN) < _SURPRISE_P:
-        shift = found.values[LAG] / MICROSECOND_S
+        shift = quantity(float(found.values[LAG]), "s")
         reasons.append(
             f"scans and step test contradict each other: the lag would have to change by "
-            f"{shift:.2f} µs, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
+            f"{shift}, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
             "repeat the step test with the settings of the scans"
         )
     latency, spread = (
@@ -263,7 +264,7 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
     )
     if latency < -_SURPRISE_SIGMAS * np.sqrt(spread):
         reasons.append(
-            f"the probe would have to be {-latency / MICROSECOND_S:.1f} µs early: the structure "
+            f"the probe would have to be {quantity(-latency, 's')} early: the structure "
             "lags more in the scans than in the step test; repeat the step test"
         )
     if not reasons:

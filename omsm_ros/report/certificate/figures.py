@@ -23,6 +23,7 @@ from omsm_ros.core.identification.fitted_record import (
     mean_at_edges,
 )
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.readable import quantity
 from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import bode
 from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOMETRE_M
@@ -47,7 +48,7 @@ def response_with_band(calibration: Calibration, seen: FrequencyResponse | None 
     style.legend_above(gain)
     if calibration.valid_up_to < gain.get_xlim()[1]:
         phase.annotate(
-            f"{calibration.valid_up_to:.3g} Hz", (calibration.valid_up_to, 0), (-3, 3),
+            quantity(calibration.valid_up_to, "Hz"), (calibration.valid_up_to, 0), (-3, 3),
             ("data", "axes fraction"), "offset points", ha="right", va="bottom",
             fontsize=style.TEXT_PT, color=style.MUTED,
         )  # fmt: skip

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import jinja2
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
@@ -14,19 +12,14 @@ from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import NOTHING, measured, number, percent, plain, quantity
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import reading as reading
 from omsm_ros.report.certificate import tables as tables
 from omsm_ros.report.common import style
-from omsm_ros.report.common.measured import measured, number, plain
 from omsm_ros.report.common.response_figures import step_response
-from omsm_ros.report.common.tables import (
-    NOTHING,
-    Table,
-    latency_text,
-    mapping_table,
-    quantity,
-)
+from omsm_ros.report.common.tables import Table, latency_text, mapping_table
+from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.measurement.page import Headline
 from omsm_ros.units import DEGREE_RAD, PPM
@@ -110,20 +103,14 @@ def _bridged(fitted: FittedRecord) -> FloatArray:
 
 def render(certificate: CertificatePage) -> str:
     """The page as HTML; all text from outside is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("omsm_ros.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("certificate.html").render(
+    return fill(
+        "certificate.html",
         certificate=certificate,
         verdict=verdict_on_calibration(certificate.calibration),
         headlines=headlines(certificate.calibration),
         sections=sections(certificate),
         band=BAND,
-        picture=lambda name: b64encode(certificate.figures[name]).decode(),
+        picture=lambda name: picture(certificate.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
 
@@ -165,7 +152,7 @@ def _band_text(calibration: Calibration) -> str:
     at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
     band = response_band(calibration.dynamics, calibration.covariance, at)
     gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
-    return f"±{plain(100 * gain, 2)} % in gain and ±{plain(phase / DEGREE_RAD, 2)}° in phase"
+    return f"±{percent(gain)} in gain and ±{plain(phase / DEGREE_RAD, 2)}° in phase"
 
 
 def headlines(calibration: Calibration) -> list[Headline]:

@@ -7,9 +7,9 @@ from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.modes import KnownMode, known_modes
+from omsm_ros.readable import NOTHING, measured, number, percent, plain, quantity
 from omsm_ros.report.certificate.tables import CertificateEntries, known_rows
-from omsm_ros.report.common.measured import measured, number, plain
-from omsm_ros.report.common.tables import NOTHING, Table, part, quantity
+from omsm_ros.report.common.tables import Table, part
 from omsm_ros.units import MILLISECOND_S
 
 
@@ -86,9 +86,7 @@ def shape_table(calibration: Calibration) -> Table:
     ]
     left = number(certificate.get("modal_remainder"))
     if left is not None:
-        rows.append(
-            ("not in the terms of Eq. 8, of the greatest gain", f"{plain(100 * left, 2)} %", "yes")
-        )
+        rows.append(("not in the terms of Eq. 8, of the greatest gain", percent(left), "yes"))
     columns = ("", "within the trusted band")
     return Table("Shape of the response", columns, known_rows(rows, 1))
 

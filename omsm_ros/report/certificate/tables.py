@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration
-from omsm_ros.report.common.measured import measured, number, plain, probability, raised
-from omsm_ros.report.common.tables import NOTHING, Table, count, mapping_table, part, quantity
+from omsm_ros.readable import NOTHING, count, measured, number, plain, probability, quantity, raised
+from omsm_ros.report.common.tables import Table, mapping_table, part
 from omsm_ros.units import PPM
 
 # Where a p-value is called small.

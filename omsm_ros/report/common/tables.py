@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +10,8 @@ from typing import Any
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.errors import CalibrationError
+from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
 
-NOTHING = "–"
-# Nothing smaller than nano: lengths below it are read as 0.31 nm.
-_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-_THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
 _FIGURE_NAMES = {
     "peak_to_valley": "peak to valley",
     "rms": "rms, every point alike",
@@ -30,28 +26,6 @@ class Table:
     title: str
     columns: Sequence[str]
     rows: Sequence[tuple[str, ...]]
-
-
-def quantity(value: object, unit: str, digits: int = 3) -> str:
-    """A number with an SI prefix, rounded to ``digits``: ``83.1 nm``; a dash for no number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return NOTHING
-    # Rounded first: 999.96 becomes 1.00 k, not 1000.
-    rounded = float(f"{value:.{digits - 1}e}")
-    if rounded == 0:
-        return f"0{_THIN_SPACE}{unit}"
-    magnitude = math.floor(math.log10(abs(rounded)))
-    exponent = min(max(3 * (magnitude // 3), min(_PREFIXES)), max(_PREFIXES))
-    decimals = max(digits - 1 - (magnitude - exponent), 0)
-    text = f"{rounded / 10.0**exponent:.{decimals}f}".replace("-", "−")
-    return f"{text}{_THIN_SPACE}{_PREFIXES[exponent]}{unit}"
-
-
-def count(value: object) -> str:
-    """A number of things, its thousands apart; a dash for no number."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        return NOTHING
-    return f"{value:,}".replace(",", _THIN_SPACE)
 
 
 def part(mapping: Mapping[str, Any], *path: str) -> Any:
@@ -97,9 +71,9 @@ def motion_table(summary: Mapping[str, object]) -> Table:
         ("left by the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
         (
             "motion beyond the trusted band",
-            NOTHING if outside is None else f"{100 * outside:.2g} %",
+            percent(outside),
         ),
-        ("could have run faster by", NOTHING if factor is None else f"{factor:.3g} ×"),
+        ("could have run faster by", NOTHING if factor is None else f"{plain(factor)} ×"),
         ("the limit that binds then", str(prediction.get("binding") or NOTHING)),
         ("limits not evaluated", ", ".join(prediction.get("not_evaluated") or ()) or NOTHING),
         (
@@ -132,16 +106,17 @@ def latency_text(calibration: Calibration) -> str:
         return NOTHING
     if latency.share is None:
         return f"not known ({latency.source})"
-    return f"{_seconds(latency.delay_s, latency.uncertainty_s)} ({latency.source})"
+    return f"{measured(latency.delay_s, latency.uncertainty_s, 's')} ({latency.source})"
 
 
 def calibration_table(calibration: Calibration) -> Table:
     """What was identified and how well."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
-    gain = _with_uncertainty(calibration.static_gain, certificate.get("static_gain_uncertainty"))
-    delay = _seconds(
+    gain = measured(calibration.static_gain, certificate.get("static_gain_uncertainty"), digits=6)
+    delay = measured(
         certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay),
         certificate.get("low_frequency_delay_uncertainty_s"),
+        "s",
     )
     rows = [
         ("verdict", str(certificate.get("verdict", NOTHING))),
@@ -149,15 +124,15 @@ def calibration_table(calibration: Calibration) -> Table:
         ("static gain, probe per encoder", gain),
         ("delay of slow motion", delay),
         ("of it latency of the probe", latency_text(calibration)),
-        ("chi-square per degree of freedom", _plain(certificate.get("chi_square"))),
+        ("chi-square per degree of freedom", plain(certificate.get("chi_square"))),
         ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
-        ("whiteness of the residual, p", _plain(certificate.get("whiteness_p"))),
-        ("its independence of the motion, p", _plain(certificate.get("independence_p"))),
+        ("whiteness of the residual, p", plain(certificate.get("whiteness_p"))),
+        ("its independence of the motion, p", plain(certificate.get("independence_p"))),
         ("edges used", count(certificate.get("edges"))),
         ("sample period", quantity(calibration.sample_period, "s")),
     ]
     for number, mode in enumerate(dynamics.modes(), start=1):
-        text = f"{quantity(mode.frequency, 'Hz')}, damping {_plain(mode.damping)}"
+        text = f"{quantity(mode.frequency, 'Hz')}, damping {plain(mode.damping)}"
         rows.append((f"mode {number}", text))
     rows.append(("identity", calibration.id[:16]))
     return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
@@ -173,23 +148,6 @@ def remarks_table(calibration: Calibration) -> Table:
     certificate: Mapping[str, Any] = calibration.certificate
     remarks = [*(certificate.get("reasons") or ()), *(certificate.get("warnings") or ())]
     return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
-
-
-def _with_uncertainty(value: float, uncertainty: object) -> str:
-    if not isinstance(uncertainty, float) or not 0 < uncertainty < 1:
-        return f"{value:.6f}"
-    decimals = 1 - math.floor(math.log10(uncertainty))
-    return f"{value:.{decimals}f} ± {uncertainty:.{decimals}f}"
-
-
-def _seconds(value: object, uncertainty: object) -> str:
-    text = quantity(value, "s", 4)
-    spread = quantity(uncertainty, "s", 2)
-    return text if spread == NOTHING else f"{text} ± {spread}"
-
-
-def _plain(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, int | float) else NOTHING
 
 
 def _json_text(value: object) -> str:

@@ -8,8 +8,8 @@ from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import REMEDY, latency_of
-from omsm_ros.report.common.tables import count, part
-from omsm_ros.units import MICROSECOND_S
+from omsm_ros.readable import count, percent, quantity
+from omsm_ros.report.common.tables import part
 
 # A map with more holes than this hides something.
 _LEAST_SHARE_CORRECTED = 0.95
@@ -67,7 +67,7 @@ def _latency(calibration: Calibration | None) -> list[str]:
         return []
     lag = calibration.dynamics.low_frequency_delay
     return [
-        f"of the lag of {lag / MICROSECOND_S:.1f} µs any part may be latency of the probe, by "
+        f"of the lag of {quantity(lag, 's', 4)} any part may be latency of the probe, by "
         f"which X and C would have to be delayed (lateral_lag in the budget): {REMEDY}"
     ]
 
@@ -77,6 +77,6 @@ def _losses(summary: Mapping[str, object]) -> list[str]:
     for name, stream in _streams(summary).items():
         lost = stream["received"] - stream["corrected"]
         if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
-            share = 100 * lost / stream["received"]
-            found.append(f"{name}: {count(lost)} samples ({share:.1f} %) gave no point")
+            share = percent(lost / stream["received"])
+            found.append(f"{name}: {count(lost)} samples ({share}) gave no point")
     return found

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import jinja2
-
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import quantity
 from omsm_ros.report.common import tables
-from omsm_ros.report.common.tables import part, quantity
+from omsm_ros.report.common.tables import part
+from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
 
 
@@ -93,20 +92,14 @@ class Headline:
 
 def render(report: Report) -> str:
     """The page as HTML; all text from outside is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("omsm_ros.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html").render(
+    return fill(
+        "report.html",
         report=report,
         verdict=verdict_on_measurement(report.summary, report.calibration),
         headlines=headlines(report.summary),
         sections=_sections(report),
         records=_records(report),
-        picture=lambda name: b64encode(report.figures[name]).decode(),
+        picture=lambda name: picture(report.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
 

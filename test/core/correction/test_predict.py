@@ -131,7 +131,7 @@ def test_a_hopeless_calibration_has_no_safe_speed() -> None:
 
 def test_message_tells_error_residual_and_advice() -> None:
     message = predicted(late_probe(2e-6), sine(1.0)).message
-    assert "1885 nm peak to valley" in message
+    assert "1.88 µm peak to valley" in message
     assert "within 12.6 nm (k = 2, largest on the path)" in message
     assert "up to 3.98 times as fast; then dynamics binds" in message
 

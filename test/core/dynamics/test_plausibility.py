@@ -49,7 +49,12 @@ def test_what_is_good_comes_through() -> None:
         ([0.0, 1e-4], [1.0, 1e-3, 1e-6], 0.0, r"G_m\(0\)"),
         ([1.0, 1e-4], [1.0, 1e-3, 1e-6], 1000.0, "delay is 1000.0 s"),
         ([1.0, 1e-4], [1.0, 1e5, 1.0], 0.0, r"time constant of G_m is 99999\.9"),
-        ([1.0, 1e-4], [1.0, 500.0, 1e-6], 0.0, "slowest decay of G_m is 500 s, 5e.05 samples"),
+        (
+            [1.0, 1e-4],
+            [1.0, 500.0, 1e-6],
+            0.0,
+            "slowest decay of G_m is 500.0 s: 5.00 · 10⁵",
+        ),
         ([1.0, 1e-4], [1.0, 1e-3, 1e-300], 0.0, "G_m"),
         ([1.0, 1e-4], [1.0, 1e-3, 1e300], 0.0, "G_m"),
         ([1.0, 1e300], [1.0, 1e-3, 1e-6], 0.0, "time constant of G_m"),
@@ -68,7 +73,7 @@ def test_a_delay_of_many_samples_is_refused_for_its_filter() -> None:
     late = TransferFunction([1.0], [1.0], 0.5)
     none = np.zeros((2, 2))
     assert changed(dynamics=late, covariance=none).dynamics.delay == 0.5
-    with pytest.raises(CalibrationError, match=r"delay of G_m is 0.5 s, 2.5e\+04 samples"):
+    with pytest.raises(CalibrationError, match=r"delay of G_m is 500.0 ms: 2.50 · 10⁴ samples"):
         changed(dynamics=late, covariance=none, sample_period=2e-5)
 
 

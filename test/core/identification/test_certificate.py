@@ -27,9 +27,9 @@ def evidence(step_test):
 
 
 def test_the_verdict_says_what_the_data_support():
-    assert verdict([], [], 0.015, 80.0) == "accepted, supported by data from 0.015 to 80 Hz"
+    assert verdict([], [], 0.015, 80.0) == "accepted, supported by data from 0.015 Hz to 80.0 Hz"
     kept = verdict([], ["creep"], 0.015, 80.0)
-    assert kept == "accepted with reservations, supported by data from 0.015 to 80 Hz"
+    assert kept == "accepted with reservations, supported by data from 0.015 Hz to 80.0 Hz"
     assert verdict(["sharp edges"], ["creep"], 0.015, 80.0) == "rejected"
 
 

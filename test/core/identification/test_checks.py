@@ -61,7 +61,7 @@ def test_a_bias_below_five_nanometres_of_a_scan_is_held_by_the_band():
 
 def test_a_pole_beyond_the_trusted_band_is_warned_of():
     (text,) = poles_beyond(FAST, 80.0, 500.0).warnings
-    assert "1592 Hz" in text
+    assert "1.59 kHz" in text
 
 
 def test_a_wrong_order_asked_for_is_the_cause():

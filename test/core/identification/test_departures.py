@@ -279,8 +279,8 @@ def test_a_reference_on_time_is_accepted():
 def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell():
     assert not gain_above_rest(1e-4, 5.0, 0.5, 5e-3).reasons
     (reason,) = gain_above_rest(1e-2, 5.0, 0.5, 5e-3).reasons
-    assert "2 %" in reason
-    assert "rest 5 s on each plateau" in reason
+    assert "by 2.0 %" in reason
+    assert "rest 5.0 s on each plateau" in reason
 
 
 def test_a_failure_of_the_algebra_is_one_clear_error(monkeypatch):

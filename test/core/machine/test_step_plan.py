@@ -80,5 +80,5 @@ def test_two_heights_alternate_and_come_back_to_the_start():
 
 def test_a_smaller_second_step_makes_room_for_more():
     plan_steps(sample_period=1e-3, second_step=3e-6, count=15)
-    with pytest.raises(ConfigurationError, match=r"15 steps travel 0.000147 m.*range"):
+    with pytest.raises(ConfigurationError, match=r"15 steps travel 147 µm.*range"):
         plan_steps(sample_period=1e-3, count=15)

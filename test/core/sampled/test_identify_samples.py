@@ -158,14 +158,14 @@ class TestVerdict:
         return sampled_certificate(**(given | changed))
 
     def test_good_evidence_is_accepted_within_its_range(self):
-        assert self.certified()["verdict"] == "accepted from 0.1 to 3 Hz"
+        assert self.certified()["verdict"] == "accepted from 0.100 Hz to 3.00 Hz"
         assert self.certified()["warnings"] == []
 
     @pytest.mark.parametrize(
         ("changed", "says"),
         [
-            ({"entries": {"predicted": 0.4}}, "account for 40.0%"),
-            ({"valid": (0.1, 0.1)}, "known nowhere to 10%"),
+            ({"entries": {"predicted": 0.4}}, "account for 40.0 %"),
+            ({"valid": (0.1, 0.1)}, "known nowhere to 10 %"),
         ],
     )
     def test_bad_evidence_is_rejected_by_name(self, changed, says):

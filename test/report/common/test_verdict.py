@@ -48,7 +48,7 @@ def test_many_missing_points_are_a_reservation(summary, certified):
     summary["samples"]["distance"] = lost
     verdict = verdict_on_measurement(summary, certified)
     assert verdict.level == "care"
-    assert verdict.reasons == ("distance: 10 samples (10.0 %) gave no point",)
+    assert verdict.reasons == ("distance: 10 samples (10 %) gave no point",)
 
 
 def test_warnings_of_an_accepted_calibration_do_not_count(summary, certified):

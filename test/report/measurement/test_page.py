@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 import pytest
 
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.report.common.template import typeset
 from omsm_ros.report.measurement.page import CAPTIONS, Report, headlines, render
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -123,7 +124,7 @@ def test_a_correction_without_truth_and_step_test(summary, certified):
 
 def test_settings_that_are_those_of_the_calibration_are_said_once(summary, certified):
     same = replace(certified, settings=summary["settings"])
-    assert render(Report("a", "b", summary, same)).count("exposure 1 ms") == 1
+    assert render(Report("a", "b", summary, same)).count(typeset("exposure 1 ms")) == 1
 
 
 @pytest.mark.parametrize(

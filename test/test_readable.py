@@ -9,13 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omsm_ros.report.common.measured import measured, number, plain, probability, raised
+from omsm_ros.readable import (
+    NOTHING,
+    chance,
+    count,
+    measured,
+    number,
+    percent,
+    plain,
+    probability,
+    quantity,
+    raised,
+)
 
 FACTORS = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
-
-
-def spaced(text):
-    return text.replace("\u202f", " ").replace("−", "-")
 
 
 @pytest.mark.parametrize(
@@ -40,7 +47,7 @@ def spaced(text):
     ],
 )
 def test_reads_as_it_should(value, uncertainty, unit, expected):
-    assert spaced(measured(value, uncertainty, unit)) == expected
+    assert measured(value, uncertainty, unit) == expected
 
 
 @given(
@@ -50,7 +57,7 @@ def test_reads_as_it_should(value, uncertainty, unit, expected):
 )
 def test_what_is_read_back_is_what_was_written_within_the_uncertainty(value, uncertainty, unit):
     """Read as a reader does: number, prefix, unit."""
-    text = spaced(measured(value, uncertainty, unit))
+    text = measured(value, uncertainty, unit)
     found = re.fullmatch(rf"(-?[\d.]+) (\D?){unit} ± ([\d.]+) (\D?){unit}", text)
     assert found, text
     assert found[2] == found[4]
@@ -76,7 +83,7 @@ def test_what_is_read_back_is_what_was_written_within_the_uncertainty(value, unc
     ],
 )
 def test_plain_numbers(value, digits, expected):
-    assert spaced(plain(value, digits)) == expected
+    assert plain(value, digits) == expected
 
 
 def test_probabilities():
@@ -93,3 +100,74 @@ def test_only_finite_numbers_are_numbers():
 
 def test_powers_are_raised():
     assert raised(-12) == "⁻¹²"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (83.14e-9, "83.1 nm"),
+        (8.949e-6, "8.95 µm"),
+        (178.9e-9, "179 nm"),
+        (999.96e-9, "1.00 µm"),
+        (-2.5e-6, "-2.50 µm"),
+        (0.314e-9, "0.314 nm"),
+        (12.7e-3, "12.7 mm"),
+        (1.0, "1.00 m"),
+        (0.0, "0 m"),
+        (3, "3.00 m"),
+    ],
+)
+def test_a_length_has_three_digits_and_its_prefix(value, text):
+    assert quantity(value, "m") == text
+
+
+@pytest.mark.parametrize("value", [None, float("nan"), float("inf"), "5", True])
+def test_what_is_no_number_is_a_dash(value):
+    assert quantity(value, "m") == NOTHING
+    assert count(value) == NOTHING
+
+
+@given(st.floats(1e-9, 1e8) | st.floats(-1e8, -1e-9))
+def test_a_quantity_reads_back(value):
+    number, unit = quantity(value, "Hz").split(" ")
+    assert float(number) * FACTORS[unit.removesuffix("Hz")] == pytest.approx(value, rel=5.1e-3)
+    assert len(number.strip("-").replace(".", "").lstrip("0")) == 3
+
+
+def test_a_count_has_its_thousands_apart():
+    assert count(254000) == "254 000"
+    assert count(0) == "0"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (1500.0, "kg", "1500 kg"),
+        (0.25, "kg", "0.250 kg"),
+        (-1850.4, "ppm", "-1850 ppm"),
+        (0.5, "", "0.500"),
+        (0.0, "°", "0 °"),
+        (0.0154, "Hz", "0.0154 Hz"),
+    ],
+)
+def test_what_takes_no_prefix(value, unit, text):
+    assert quantity(value, unit) == text
+
+
+def test_a_change_has_its_sign():
+    assert quantity(2.5e-6, "s", signed=True) == "+2.50 µs"
+    assert quantity(-2.5e-6, "s", signed=True) == "-2.50 µs"
+    assert quantity(0.0, "s", signed=True) == "0 s"
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [(0.0012, 2, "0.12 %"), (1.5, 2, "150 %"), (0.99996, 4, "100.0 %"), (None, 2, "–")],
+)
+def test_a_share_in_per_cent(share, digits, text):
+    assert percent(share, digits) == text
+
+
+def test_a_chance_in_a_sentence():
+    assert chance(0.234567) == "p = 0.235"
+    assert chance(1e-300) == "p < 0.0001"

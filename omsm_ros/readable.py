@@ -1,0 +1,127 @@
+"""Numbers as people read them: SI prefixes, units, rounding, uncertainties.
+
+Every text for people (messages, verdicts, tables of the command line, pages) takes its numbers
+from here. Plain characters throughout, so that a terminal shows and a search finds them; pages
+replace them by typographic ones (:mod:`omsm_ros.report.common.typography`). A number that the
+reader is to type back stays in the unit of its field instead.
+"""
+
+from __future__ import annotations
+
+import math
+
+NOTHING = "–"
+# Nothing smaller than nano: lengths below it are read as 0.31 nm.
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+_WITHOUT_PREFIX = {"", "%", "°", "ppm", "kg", "rpm"}
+# A value far smaller than its uncertainty, or far larger, gets no absurd row of digits.
+_MOST_DECIMALS = 9
+_LEAST_PROBABILITY = 1e-4
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: object) -> float | None:
+    """Return ``value`` as float if it is a finite number, None if it is anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) else None
+
+
+def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) -> str:
+    """Return a number with an SI prefix, rounded to ``digits``: ``83.1 nm``.
+
+    value: in ``unit``, which has no prefix of its own; what is no number gives a dash
+    signed: a plus before what is positive
+    """
+    known = number(value)
+    if known is None:
+        return NOTHING
+    # Rounded first: 999.96 becomes 1.00 k, not 1000.
+    rounded = float(f"{known:.{digits - 1}e}")
+    exponent = _exponent(rounded, unit)
+    tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
+    sign = "+" if signed and rounded > 0 else ""
+    return f"{sign}{_fixed(rounded, digits, exponent)}{tail}"
+
+
+def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4) -> str:
+    """Return a value and its standard uncertainty as the GUM wants them: ``339.7 µs ± 1.1 µs``.
+
+    Two digits of the uncertainty, the value to the same place. Without an uncertainty the value
+    alone, to ``digits``; without a unit no prefix either.
+    """
+    known, spread = number(value), number(uncertainty)
+    if known is None:
+        return NOTHING
+    if not spread or spread < 0:
+        return quantity(known, unit, digits) if unit else plain(known, digits)
+    # Rounded first: an uncertainty of 0.996 is one of 1.0.
+    spread = float(f"{spread:.1e}")
+    exponent = _exponent(max(abs(known), spread), unit)
+    decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
+    tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
+    return " ± ".join(f"{part / 10.0**exponent:.{decimals}f}{tail}" for part in (known, spread))
+
+
+def plain(value: object, digits: int = 3) -> str:
+    """Return a number without a unit, to ``digits``; a dash for anything else."""
+    known = number(value)
+    if known is None:
+        return NOTHING
+    if known == 0:
+        return "0"
+    if 1e-3 <= abs(known) < 10**digits:
+        return f"{known:#.{digits}g}".rstrip(".")
+    mantissa, _, power = f"{known:.{digits - 1}e}".partition("e")
+    return f"{mantissa} · 10{raised(int(power))}"
+
+
+def percent(share: object, digits: int = 2) -> str:
+    """Return a share as ``0.12 %``; a dash for no number."""
+    known = number(share)
+    return NOTHING if known is None else quantity(100 * known, "%", digits)
+
+
+def count(value: object) -> str:
+    """Return a number of things, its thousands apart: ``290 011``; a dash for no number."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        return NOTHING
+    return f"{value:,}".replace(",", " ")
+
+
+def probability(value: object) -> str:
+    """Return a p-value to three digits, or that it is smaller than one could care for."""
+    known = number(value)
+    if known is None:
+        return NOTHING
+    least = _LEAST_PROBABILITY
+    return f"< {least:g}" if known < least else f"{known:.3g}"
+
+
+def chance(value: object) -> str:
+    """Return a p-value for a sentence: ``p = 0.23``, ``p < 0.0001``."""
+    text = probability(value)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def raised(power: int) -> str:
+    """Return a power as a superscript."""
+    return str(power).translate(_SUPERSCRIPTS)
+
+
+def _exponent(value: float, unit: str) -> int:
+    """Power of ten of the prefix."""
+    if unit in _WITHOUT_PREFIX or not value:
+        return 0
+    exponent = 3 * (math.floor(math.log10(abs(value))) // 3)
+    # A millihertz is easily taken for a megahertz.
+    least = 0 if unit == "Hz" else min(_PREFIXES)
+    return min(max(exponent, least), max(_PREFIXES))
+
+
+def _fixed(rounded: float, digits: int, exponent: int) -> str:
+    if not rounded:
+        return "0"
+    magnitude = math.floor(math.log10(abs(rounded)))
+    decimals = max(digits - 1 - (magnitude - exponent), 0)
+    return f"{rounded / 10.0**exponent:.{decimals}f}"
