@@ -19,7 +19,7 @@ LAYERS = [
     {"twin", "protocols"},
     {"core"},
     {"quantities"},
-    {"errors", "units", "readable", "scipy_parts"},
+    {"errors", "units", "readable", "least_squares", "scipy_parts"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 

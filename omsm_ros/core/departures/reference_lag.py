@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.fitting.least_squares import unit_columns
 from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.least_squares import unit_columns
 
 # Interpolation at a lost reading is no reading: so many neighbours of it are left out.
 _LEAST_SAMPLES = 50

@@ -15,9 +15,9 @@ import numpy as np
 from scipy import fft, stats
 
 from omsm_ros.core.fitting.covariance import noise_spectrum
-from omsm_ros.core.fitting.least_squares import orthonormal
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.least_squares import orthonormal
 
 # Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
 _IMITATED = 1e-4

@@ -6,9 +6,9 @@ import numpy as np
 from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.least_squares import unit_columns
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.least_squares import unit_columns
 
 _MAX_NOISE_ORDER = 12
 # Directions of the parameter space this much weaker than the strongest are lost in rounding.

@@ -14,8 +14,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import signal
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.least_squares import least_squares
 
 # Steiglitz and McBride (1965): it has converged, or will not.
 _ITERATIONS = 8

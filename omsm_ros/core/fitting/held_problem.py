@@ -17,10 +17,10 @@ from numpy.polynomial import polynomial
 from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.least_squares import least_squares
 
 # w over the rate of a section, per (1 - q)/(1 + q), where the rate is half the sampling rate:
 # half way between the slowest and the fastest that a sampled pole can be.

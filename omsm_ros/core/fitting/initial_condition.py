@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.fitting.least_squares import orthonormal
 from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.least_squares import orthonormal
 
 # χ² a column must explain to be taken: four sigma.
 _CLEARLY_SHOWN = 16.0

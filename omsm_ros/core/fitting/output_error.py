@@ -19,10 +19,10 @@ import numpy as np
 from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.least_squares import least_squares
 
 _RANK_TOLERANCE = 1e-12
 _RACE_EVALUATIONS = 5

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.output_error import Problem
 from omsm_ros.core.fitting.steps import (
     LEAST_SAMPLES,
@@ -23,6 +22,7 @@ from omsm_ros.core.fitting.steps import (
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
+from omsm_ros.least_squares import least_squares
 from omsm_ros.readable import quantity
 
 # What happened before the record is forgotten after this time.

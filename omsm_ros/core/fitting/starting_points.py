@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roots
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.least_squares import least_squares
 
 # Guess of the slowest pole, in units of the rate at which the motion has its content.
 _GUESSED_RATE = 3.0

@@ -27,12 +27,12 @@ from omsm_ros.core.dynamics.response_band import (
     relative_response_jacobian,
 )
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.least_squares import least_squares
 from omsm_ros.readable import percent, quantity
 
 # Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and

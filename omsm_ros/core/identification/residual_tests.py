@@ -14,10 +14,10 @@ from scipy import fft, stats
 
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.fitting.covariance import autoregression
-from omsm_ros.core.fitting.least_squares import orthonormal
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.least_squares import orthonormal
 
 _LAGS = 25
 # After an edge the response is looked at for this long.

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.fitting.least_squares import unit_columns
 from omsm_ros.core.fitting.steps import Edge, find_steps
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
+from omsm_ros.least_squares import unit_columns
 
 # Rest after an edge that is not averaged, for the response to settle.
 _SETTLE_S = 0.1

@@ -24,7 +24,6 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import parameter_covariance
 from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
 from omsm_ros.core.fitting.held_problem import coefficients
-from omsm_ros.core.fitting.least_squares import least_squares
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.sampled.band_limited import band_limited
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
@@ -35,6 +34,7 @@ from omsm_ros.core.sampled.verdict import (
 )
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.least_squares import least_squares
 
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
 _FREQUENCIES = 400

@@ -20,6 +20,7 @@ from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.errors import DataError
+from omsm_ros.least_squares import least_squares, unit_columns
 from omsm_ros.units import MICROMETRE_M
 
 _COLUMNS = ("x", "y", "z", "b", "c", "distance")
@@ -218,7 +219,7 @@ def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool
     points = workpiece_points(geometry, (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance)
     ones = np.ones(len(points.x))
     terms = np.stack([ones, points.x, points.y, points.x**2 + points.y**2], axis=1)
-    level, slope_x, slope_y, _ = np.linalg.lstsq(terms, points.height, rcond=None)[0]
+    level, slope_x, slope_y, _ = least_squares(terms, points.height)
     centre = np.array([-slope_x * radius, -slope_y * radius, level + radius]) / MICROMETRE_M
     known = np.array([geometry.centre_x, geometry.centre_y]) / MICROMETRE_M
     lean = np.array([geometry.beam_x, geometry.beam_y]) / _SLOPE_UNIT
@@ -229,8 +230,8 @@ def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> Float
     """From residuals that may be correlated within groups of consecutive points."""
     # Through the singular values of scaled columns: the normal equations would square the
     # condition number, and with it lose what is barely known.
-    scale = np.linalg.norm(jacobian, axis=0)
-    _, values, rows = np.linalg.svd(jacobian / scale, full_matrices=False)
+    unit, scale = unit_columns(jacobian)
+    _, values, rows = np.linalg.svd(unit, full_matrices=False)
     root = rows.T / values / scale[:, np.newaxis]
     inverse = root @ root.T
     edges = np.arange(0, len(residual), _GROUP_POINTS)

@@ -15,6 +15,7 @@ from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
+from omsm_ros.least_squares import least_squares
 from omsm_ros.readable import plain
 
 _SECTORS = 12
@@ -87,12 +88,9 @@ def level(
     """
     weight = np.ones_like(deviation) if weights is None else weights
     _check(x=x, y=y, deviation=deviation, weights=weight)
-    # Scaled to the aperture, the three columns are of one size.
-    scale = max(np.ptp(x), np.ptp(y)) or 1.0
-    columns = [np.ones_like(x), x / scale, y / scale] if tilt else [np.ones_like(x)]
-    design = np.column_stack(columns)
+    design = np.column_stack([np.ones_like(x), x, y] if tilt else [np.ones_like(x)])
     root = np.sqrt(weight)
-    fitted = np.linalg.lstsq(design * root[:, np.newaxis], deviation * root, rcond=None)[0]
+    fitted = least_squares(design * root[:, np.newaxis], deviation * root)
     return np.asarray(deviation - design @ fitted, np.float64)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.fitting.least_squares import (
+from omsm_ros.least_squares import (
     least_squares,
     orthonormal,
     unexplained,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import FloatArray
+FloatArray = NDArray[np.float64]
 
 
 def unit_columns(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
