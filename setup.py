@@ -28,7 +28,10 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     install_requires=(ROOT / "bootstrap" / "runtime.in").read_text().splitlines(),
-    extras_require={"test": ["pytest", "pytest-timeout", "hypothesis"]},  # colcon test: use pytest
+    extras_require={
+        "test": ["pytest", "pytest-timeout", "hypothesis"],  # colcon test: use pytest
+        "formats": ["h5py"],
+    },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
     # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace
     # built with --symlink-install, the code finds msg_defs/ itself:

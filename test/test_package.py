@@ -1,6 +1,7 @@
 """package.xml is valid after REP 149 and names all that the package needs, and nothing else."""
 
 import ast
+import re
 import sys
 from pathlib import Path
 
@@ -26,6 +27,9 @@ ROSDEP = {
     "cobs": ("cobs", None),
 }
 
+# Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.
+OPTIONAL = {"h5py": "formats"}
+
 
 def parsed(folder):
     package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is not installed")
@@ -45,7 +49,11 @@ def imported(folder):
             yield from (name.split(".")[0] for name in names)
 
 
-NEEDED = {*imported("omsm_ros"), *imported("launch")} - {*sys.stdlib_module_names, "omsm_ros"}
+NEEDED = {*imported("omsm_ros"), *imported("launch")} - {
+    *sys.stdlib_module_names,
+    *OPTIONAL,
+    "omsm_ros",
+}
 
 
 @pytest.mark.parametrize("folder", [ROOT, ROOT / "msg_defs"], ids=["omsm_ros", "omsm_msgs"])
@@ -78,3 +86,12 @@ def test_the_readme_says_what_rosdep_cannot_install():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     for name, key in ROSDEP.values():
         assert key or f"`{name}`" in readme
+
+
+def test_what_is_optional_is_an_extra():
+    setup = (ROOT / "setup.py").read_text(encoding="utf-8")
+    found = re.search(r"extras_require=(\{.*?\}),", setup, re.DOTALL)
+    extras = ast.literal_eval(found[1])
+    assert {package for package, extra in OPTIONAL.items() if package in extras[extra]} == {
+        *OPTIONAL
+    }

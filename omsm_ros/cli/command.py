@@ -34,18 +34,18 @@ class Command:
 
 
 @contextmanager
-def progress_bar(title: str, quiet: bool) -> Iterator[Progress]:
-    """A bar on stderr that counts messages; silent for programs and in pipes."""
+def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[Progress]:
+    """A bar on stderr that counts messages or ``unit``; silent for programs and in pipes."""
     if quiet or not sys.stderr.isatty():
         yield no_progress
         return
     # Here, because most commands run for programs, and nobody would see it.
     from tqdm import tqdm
 
-    with tqdm(desc=title, unit=" messages", leave=False) as bar:
+    with tqdm(desc=title, unit=unit, leave=False) as bar:
 
         def advance(done: int, total: int) -> None:
-            bar.total = total
+            bar.total = total or None
             bar.update(done - bar.n)
 
         yield advance

@@ -29,6 +29,7 @@ WORDS = {
     "omsm_ros.cli.identifying": ("identify",),
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
     "omsm_ros.cli.starting": ("doctor",),
+    "omsm_ros.cli.importing": ("import",),
 }
 
 

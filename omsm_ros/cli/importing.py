@@ -1,0 +1,52 @@
+"""Commands that bring other programs' data in: import."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from omsm_ros.cli.command import Command, Facts, progress_bar
+from omsm_ros.jobs.import_recording import import_recording
+from omsm_ros.storage.column_map_file import load_column_map
+
+
+def _declare_import(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("files", type=Path, nargs="+", metavar="FILE")
+    sub.add_argument(
+        "--map", type=Path, required=True, metavar="MAP.yaml", help="columns, units, signs, period"
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap")
+
+
+def _import(args: argparse.Namespace) -> Facts:
+    mapped, written = load_column_map(args.map)
+    with progress_bar("importing", args.json, " samples") as progress:
+        found = import_recording(args.files, mapped, written, args.out, progress)
+    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
+
+
+def _show_import(facts: Facts) -> None:
+    for file in facts["files"]:
+        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
+        print(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
+        for count, meaning in (
+            ("missing", "trigger numbers are missing"),
+            ("invalid", "readings of the probe are none"),
+            ("lost", "rows have an axis that is no number"),
+            ("repeated_names", "lines repeat the line of names"),
+        ):
+            if file[count]:
+                print(f"    {file[count]} {meaning}")
+    print(f"written: {facts['bag']}; look at it with 'omsm inspect'")
+
+
+COMMANDS = [
+    Command(
+        "import",
+        "make a bag of CSV, NumPy, MATLAB or HDF5 files",
+        _declare_import,
+        _import,
+        _show_import,
+    ),
+]

@@ -1,0 +1,250 @@
+"""Columns of another program's recording, made into blocks of this one's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from types import MappingProxyType
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
+from omsm_ros.errors import DataError
+from omsm_ros.quantities import COUNTER, SAMPLE_PERIOD, STAMP, TIME
+from omsm_ros.units import (
+    DEGREE_RAD,
+    MICROMETRE_M,
+    MICROSECOND_S,
+    MILLIMETRE_M,
+    MILLISECOND_S,
+    NANOMETRE_M,
+    NANOSECOND_S,
+    NANOSECONDS_PER_S,
+)
+
+AXES = ("x", "y", "z", "b", "c")
+PROBE = ("distance", "intensity")
+COUNTING = ("trigger", "time")
+CHANNELS = (*AXES, *PROBE, *COUNTING)
+
+_LENGTHS = {
+    "m": 1.0,
+    "mm": MILLIMETRE_M,
+    "um": MICROMETRE_M,
+    "µm": MICROMETRE_M,
+    "nm": NANOMETRE_M,
+    "inch": 0.0254,
+}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEGREE_RAD, "turn": 2 * np.pi}
+_TIMES = {
+    "s": 1.0,
+    "ms": MILLISECOND_S,
+    "us": MICROSECOND_S,
+    "µs": MICROSECOND_S,
+    "ns": NANOSECOND_S,
+}
+UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
+    {
+        **dict.fromkeys(("x", "y", "z", "distance"), _LENGTHS),
+        **dict.fromkeys(("b", "c"), _ANGLES),
+        "intensity": {"1": 1.0, "%": 0.01},
+        "time": _TIMES,
+        "trigger": {"1": 1.0},
+    }
+)
+"""Units that a column of each channel may be in, and what one of them is in SI."""
+
+COUNT = "count"
+"""The unit of a raw reading: a column in it says what one count is in SI."""
+
+_BLOCK_SAMPLES = 10_000
+# A time that is off by more lies nearer to no sample than to its neighbour.
+_MOST_JITTER = 0.25
+# Clocks of two devices differ by less than 0.1 %; a period written wrongly by more.
+_MOST_PERIOD_ERROR = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Where a channel comes from.
+
+    name: of the column in the file; empty for a channel that stood still
+    factor: SI value of one unit of it, with the sign that makes it ours
+    constant: its value [SI] where it has no column
+    """
+
+    name: str
+    factor: float = 1.0
+    constant: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """How the columns of a foreign recording become channels.
+
+    columns: channel → its column;  sample_period: [s], None = from the column ``time``
+    start: time of sample 0 [s, Unix];  invalid: readings [SI of no unit, as they stand in the
+    file] of the probe that mean "no reading"
+    """
+
+    columns: Mapping[str, Column]
+    sample_period: float | None = None
+    start: float = 0.0
+    invalid: tuple[float, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.columns) - set(CHANNELS))
+        if unknown:
+            raise DataError(f"channel {unknown[0]!r} is unknown, expected of {list(CHANNELS)}")
+        if self.sample_period is None and "time" not in self.columns:
+            raise DataError("neither sample_period nor a column of time; give one of them")
+        if self.sample_period is not None:
+            SAMPLE_PERIOD.checked(self.sample_period, DataError, "sample_period")
+        STAMP.checked(round(self.start * NANOSECONDS_PER_S), DataError, "start")
+        if not {"z", "distance"} & set(self.columns):
+            raise DataError("neither z nor distance has a column; there is nothing to import")
+        lacking = [a for a in AXES if a not in self.columns]
+        if "z" in self.columns and lacking:
+            raise DataError(
+                f"axis {lacking[0]!r} has no column; where it stood still, say so: "
+                f"{lacking[0]}: {{constant: 0.0}}"
+            )
+
+    def names(self, channels: tuple[str, ...]) -> list[str]:
+        """Return the columns of the file that ``channels`` need, without those that stand still."""
+        return [self.columns[c].name for c in channels if c in self.columns and self.has(c)]
+
+    def has(self, channel: str) -> bool:
+        """Return whether ``channel`` is read from a column."""
+        return channel in self.columns and self.columns[channel].name != ""
+
+
+def period_of(times: FloatArray, stated: float | None) -> float:
+    """Return the sample period [s] that ``times`` (n,) [s] have, or ``stated`` where they agree.
+
+    Raises DataError where time does not rise, or the two differ by more than 0.1 %.
+    """
+    TIME.checked_all(times, DataError, "time")
+    if len(times) < 2:
+        raise DataError(f"{len(times)} rows of time, expected at least 2")
+    steps = np.diff(times)
+    if not np.all(steps > 0):
+        row = int(np.argmax(steps <= 0)) + 1
+        raise DataError(
+            f"time falls from {times[row - 1]:.9g} s to {times[row]:.9g} s at row {row}; "
+            "import the parts before and after it one by one"
+        )
+    found = float(np.median(steps))
+    whole = np.maximum(np.round(steps / found), 1.0)
+    found = float((times[-1] - times[0]) / np.sum(whole))
+    if stated is None:
+        return float(SAMPLE_PERIOD.checked(found, DataError, "sample period of the column time"))
+    if abs(found / stated - 1) > _MOST_PERIOD_ERROR:
+        raise DataError(
+            f"sample_period is {stated:g} s, but the column of time says {found:.6g} s; "
+            "correct the one that is wrong, or its unit"
+        )
+    return stated
+
+
+def counter_of_times(
+    times: FloatArray, period: float, before: tuple[float, int] | None
+) -> IntArray:
+    """Return the trigger number (n,) of each time [s]; a gap in time is a gap in the count.
+
+    before: time [s] and trigger number of the row before these, None where these are the first.
+    Counted from neighbour to neighbour, for clocks drift and a period is known to some digits
+    only. Raises DataError where a time falls, or lies between two samples.
+    """
+    TIME.checked_all(times, DataError, "time")
+    time, number = before if before is not None else (times[0] - period, -1)
+    steps = np.diff(times, prepend=time) / period
+    whole = np.round(steps)
+    off = np.abs(steps - whole)
+    if np.max(off, initial=0.0) > _MOST_JITTER:
+        row = int(np.argmax(off))
+        raise DataError(
+            f"time {times[row]:.9g} s comes {steps[row]:.3g} periods of {period:g} s after the one "
+            "before; give a column of trigger numbers, or samples taken evenly"
+        )
+    if np.min(whole, initial=1.0) < 1:
+        row = int(np.argmin(whole))
+        raise DataError(
+            f"time {times[row]:.9g} s does not rise; import the parts before and after it apart"
+        )
+    return np.asarray(number + np.cumsum(whole).astype(np.int64))
+
+
+def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
+    """Return the trigger number (n,) of each row; DataError unless whole and rising."""
+    if not np.all(np.isfinite(values)) or np.any(values != np.round(values)):
+        bad = int(np.argmax(~np.isfinite(values) | (values != np.round(values))))
+        raise DataError(f"trigger is {values[bad]!r} in a row, expected whole numbers")
+    COUNTER.checked_all(values, DataError, "trigger")
+    counter = values.astype(np.int64)
+    steps = np.diff(counter, prepend=before)
+    if not np.all(steps > 0):
+        row = int(np.argmax(steps <= 0))
+        raise DataError(
+            f"trigger {counter[row] - steps[row]} is followed by {counter[row]}; "
+            "import the parts before and after it one by one"
+        )
+    return counter
+
+
+def axis_blocks(
+    table: Mapping[str, FloatArray], mapped: ColumnMap, counter: IntArray, period: float
+) -> Iterator[AxisBlock]:
+    """Yield the axes of rows ``table`` (column name → (n,)), cut at gaps of ``counter`` (n,)."""
+    channels = {c: _channel(table, mapped.columns[c], len(counter)) for c in AXES}
+    for part, stamp_ns, first in _parts(counter, mapped.start, period):
+        yield AxisBlock(
+            stamp_ns=stamp_ns,
+            first_sample=first,
+            sample_period=period,
+            **{c: values[part] for c, values in channels.items()},
+        )
+
+
+def distance_blocks(
+    table: Mapping[str, FloatArray], mapped: ColumnMap, counter: IntArray, period: float
+) -> Iterator[DistanceBlock]:
+    """Yield the probe's readings of rows ``table``; NaN and ``invalid`` ones as no target."""
+    column = mapped.columns["distance"]
+    raw = table[column.name] if column.name else np.full(len(counter), column.constant)
+    distance = _channel(table, column, len(counter))
+    lost = ~np.isfinite(distance) | np.isin(raw, np.asarray(mapped.invalid))
+    distance = np.where(lost, np.nan, distance)
+    status = np.where(lost, Status.NO_TARGET, Status.OK).astype(np.uint8)
+    intensity = np.empty(0, np.float32)
+    if mapped.has("intensity"):
+        intensity = _channel(table, mapped.columns["intensity"], len(counter)).astype(np.float32)
+    for part, stamp_ns, first in _parts(counter, mapped.start, period):
+        yield DistanceBlock(
+            stamp_ns=stamp_ns,
+            first_sample=first,
+            sample_period=period,
+            distance=distance[part],
+            intensity=intensity[part] if len(intensity) else intensity,
+            status=status[part],
+        )
+
+
+def _channel(table: Mapping[str, FloatArray], column: Column, rows: int) -> FloatArray:
+    if not column.name:
+        return np.full(rows, column.constant)
+    return np.asarray(table[column.name] * column.factor)
+
+
+def _parts(counter: IntArray, start: float, period: float) -> Iterator[tuple[slice, int, int]]:
+    """Runs of consecutive numbers, none longer than a block: rows, stamp [ns], first number."""
+    edges = [0, *(np.flatnonzero(np.diff(counter) != 1) + 1).tolist(), len(counter)]
+    for begin, end in pairwise(edges):
+        for low in range(begin, end, _BLOCK_SAMPLES):
+            first = int(counter[low])
+            # Apart, for a float of seconds since 1970 ends at a quarter of a microsecond.
+            whole, fraction = divmod(start, 1.0)
+            elapsed = round((fraction + first * period) * NANOSECONDS_PER_S)
+            stamp_ns = int(whole) * NANOSECONDS_PER_S + elapsed
+            yield slice(low, min(low + _BLOCK_SAMPLES, end)), stamp_ns, first

@@ -1,0 +1,94 @@
+"""``MAP.yaml``: which column of a foreign recording is which channel, in which unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.core.samples.foreign_columns import CHANNELS, COUNT, UNITS, Column, ColumnMap
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.quantities import SIGNAL, shown
+from omsm_ros.storage import strict_yaml
+from omsm_ros.storage.files import read_text
+from omsm_ros.storage.foreign_tables import TextForm
+from omsm_ros.storage.schemas import NUMBER, check_form, form
+
+_MAX_BYTES = 100_000
+
+_TEXT = {"type": "string", "minLength": 1}
+_LINES = {"type": "integer", "minimum": 0, "maximum": 1000}
+_COLUMN = form(
+    {"name": _TEXT, "unit": _TEXT, COUNT: NUMBER, "sign": {"enum": [1, -1]}, "constant": NUMBER}, ()
+)
+_MAP = form(
+    {
+        "columns": form(dict.fromkeys(CHANNELS, _COLUMN), ()),
+        "sample_period": NUMBER,
+        "start": NUMBER,
+        "invalid": {"type": "array", "items": NUMBER, "maxItems": 100},
+        "delimiter": {"type": "string", "minLength": 1, "maxLength": 1},
+        "decimal": {"enum": [".", ","]},
+        "lines_before_names": _LINES,
+        "lines_after_names": _LINES,
+    },
+    ("columns",),
+)
+
+
+def load_column_map(path: Path | str) -> tuple[ColumnMap, TextForm]:
+    """Read ``MAP.yaml``; FileError for anything that is unclear, a unit above all."""
+    what = f"map {str(path)!r}"
+    text = read_text(path, _MAX_BYTES, FileError, "map")
+    content = strict_yaml.mapping_of(text, FileError, what)
+    check_form(content, _MAP, FileError, what)
+    try:
+        mapped = ColumnMap(
+            {c: _column(c, given) for c, given in content["columns"].items()},
+            content.get("sample_period"),
+            float(content.get("start", 0.0)),
+            tuple(float(value) for value in content.get("invalid", ())),
+        )
+    except DataError as err:
+        raise FileError(f"{what}: {err}") from err
+    written = TextForm(
+        content.get("delimiter", ","),
+        content.get("decimal", "."),
+        content.get("lines_before_names", 0),
+        content.get("lines_after_names", 0),
+    )
+    if written.delimiter == written.decimal:
+        raise FileError(
+            f"{what}: {written.decimal!r} stands between columns and before the fraction; "
+            "write delimiter: ';' or what the file has"
+        )
+    return mapped, written
+
+
+def _column(channel: str, given: Mapping[str, Any]) -> Column:
+    if ("name" in given) == ("constant" in given):
+        raise DataError(f"{channel} needs a column's name, or a constant; give one of them")
+    sign = float(given.get("sign", 1))
+    if "constant" in given:
+        constant = SIGNAL.checked(float(given["constant"]), DataError, f"{channel}: constant")
+        return Column("", constant=constant and constant * _factor(channel, given, sign))
+    return Column(given["name"], _factor(channel, given, sign))
+
+
+def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
+    """SI value of one unit of a column. A unit that is not written is asked for, never guessed."""
+    units = UNITS[channel]
+    if channel == "trigger":
+        return 1.0
+    unit = given.get("unit")
+    if unit == COUNT:
+        if COUNT not in given:
+            raise DataError(f"{channel}: what is one count in SI? write count: 1e-9, say")
+        value = float(given[COUNT])
+        if not 1e-15 <= abs(value) <= 1.0:
+            raise DataError(f"{channel}: one count is {value:g} in SI, expected 1e-15 to 1")
+        return value * sign
+    if unit not in units:
+        said = "has no unit" if unit is None else f"has the unit {shown(unit)}"
+        raise DataError(f"{channel} {said}; write one of {[*units, COUNT]}")
+    return units[unit] * sign
