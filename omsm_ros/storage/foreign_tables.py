@@ -179,7 +179,7 @@ class ForeignTable:
 
     def _numpy(self) -> Mapping[str, Any]:
         with open_regular(self.path, FileError, "table") as stream:
-            loaded = np.load(stream, allow_pickle=False)
+            loaded = np.load(stream)  # no pickles, by default
             if isinstance(loaded, np.ndarray):
                 return {"": loaded}
             return {name: loaded[name] for name in loaded.files}
