@@ -31,6 +31,7 @@ setup(
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis"],  # colcon test: use pytest
         "formats": ["h5py"],
+        "campaign": ["distributed"],
     },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
     # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace

@@ -191,6 +191,7 @@ BUFFER_SAMPLES = Quantity(
     "samples kept", "", 1000, 72_000_000, "keep as many as memory holds", whole=True
 )
 COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
+PROCESSES = Quantity("processes", "", 1, 1024, "one a core serves best", whole=True)
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.

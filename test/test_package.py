@@ -28,7 +28,7 @@ ROSDEP = {
 }
 
 # Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.
-OPTIONAL = {"h5py": "formats"}
+OPTIONAL = {"h5py": "formats", "distributed": "campaign"}
 
 
 def parsed(folder):

@@ -30,7 +30,11 @@ WORDS = {
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
     "omsm_ros.cli.starting": ("doctor",),
     "omsm_ros.cli.importing": ("import",),
+    "omsm_ros.cli.campaigning": ("batch",),
 }
+
+# What stands after "--" is for the command that these run in turn.
+PASS_ON = ("batch",)
 
 
 _WHAT_NEXT = """\
@@ -94,7 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_WHAT_NEXT)
         return DONE
     try:
-        return _run(_parser(given[0] if given else "").parse_args(given))
+        own, passed_on = _split(given)
+        args = _parser(own[0]).parse_args(own)
+        args.passed_on = passed_on
+        return _run(args)
     except OmsmError as err:
         _say(str(err))
         return BAD_INPUT
@@ -110,6 +117,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         _say(defect(err))
         return DEFECT
+
+
+def _split(given: list[str]) -> tuple[list[str], list[str]]:
+    """Arguments before and after "--", where the command passes the latter on."""
+    if given[0] not in PASS_ON or "--" not in given:
+        return given, []
+    place = given.index("--")
+    return given[:place], given[place + 1 :]
 
 
 def _run(args: argparse.Namespace) -> int:

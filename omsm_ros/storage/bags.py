@@ -128,6 +128,11 @@ class BagReader:
             counts[connection.topic, connection.msgtype] += connection.msgcount
         return [TopicSummary(*names, count) for names, count in sorted(counts.items())]
 
+    @property
+    def start_ns(self) -> int:
+        """When the first message was recorded [ns, ROS time]."""
+        return int(self._reader.start_time)
+
     def count(self, topics: Sequence[str]) -> int:
         """Number of messages on ``topics``."""
         return sum(t.messages for t in self.topics() if t.topic in topics)

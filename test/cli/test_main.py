@@ -143,7 +143,7 @@ def test_every_word_is_where_main_looks_for_it():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ([], "command"),
+        (["--json"], "command"),
         (["frob"], "'frob'"),
         (["identify"], "--out"),
         (["inspect", "a", "b"], "b"),

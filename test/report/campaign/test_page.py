@@ -1,0 +1,61 @@
+import html
+
+import numpy as np
+import pytest
+
+from omsm_ros.report.campaign.page import Measurement, judge, remarks, render
+
+DAY_NS = 86_400 * 10**9
+
+
+def measurement(i, rms, state="done", name=None):
+    summary = {
+        "samples": {"distance": {"received": 1000, "corrected": 990, "counted": {"settling": 10}}},
+        "deviation": {"corrected": {"rms_area_weighted": rms, "peak_to_valley": 5 * rms}},
+        "uncertainty": {"median": 10e-9},
+    }
+    said = "" if state == "done" else "no axes"
+    return Measurement(
+        name or f"{i}.mcap", state, said, i * DAY_NS, f"{i}/report.html",
+        summary if state == "done" else {},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def drifting():
+    """Twenty days at 0.5 nm a day, and one bad part."""
+    random = np.random.default_rng(1)
+    rms = 20e-9 + 0.5e-9 * np.arange(20) + random.normal(0, 0.3e-9, 20)
+    rms[11] = 200e-9
+    return [measurement(i, value) for i, value in enumerate(rms)]
+
+
+def test_outliers_and_drift_are_named_with_their_size(drifting):
+    told = remarks(drifting, judge(drifting))
+    assert any(t.startswith("11.mcap stands out: deviation from nominal") for t in told)
+    (drift,) = [t for t in told if "rms by area drifts" in t]
+    assert "pm a day" in drift or "nm a day" in drift
+    assert not any("ncertainty" in t for t in told)
+
+
+def test_few_measurements_are_said_to_be_too_few():
+    few = [measurement(0, 20e-9), measurement(1, 20e-9, "crashed")]
+    assert remarks(few, judge(few)) == [
+        "1.mcap: crashed, no axes",
+        "outliers and drift: not evaluated, of fewer than 5 measurements",
+    ]
+
+
+def test_the_page_has_a_row_for_each_and_escapes_names(drifting, true_calibration):
+    bad = measurement(20, 0, "refused", name="<script>x</script>.mcap")
+    page = render("Campaign", [*drifting, bad], true_calibration)
+    assert page.count("<tr><th>") == 1 + 21
+    assert "<script>" not in page
+    assert html.escape(bad.name) in page
+    assert 'class="out"' in page
+    assert 'href="3/report.html"' in page
+
+
+def test_a_campaign_without_any_result_has_a_page_too(true_calibration):
+    page = render("Campaign", [measurement(0, 0, "refused")], true_calibration)
+    assert "0.mcap: refused" in page
