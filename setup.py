@@ -30,7 +30,11 @@ setup(
     install_requires=(ROOT / "bootstrap" / "runtime.in").read_text().splitlines(),
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis"],  # colcon test: use pytest
-        "formats": ["h5py"],
+        "formats": [
+            "h5py",
+            "x3pio>=2; python_version >= '3.11'",
+            "SurfaceTopography>=1.20",
+        ],
         "campaign": ["distributed"],
     },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the

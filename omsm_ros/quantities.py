@@ -159,6 +159,7 @@ RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if conv
 FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
 SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
 MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
+SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 
 # --------------------------------------------------------------------------- uncertainty

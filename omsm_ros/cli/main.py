@@ -31,6 +31,7 @@ WORDS = {
     "omsm_ros.cli.starting": ("doctor",),
     "omsm_ros.cli.importing": ("import",),
     "omsm_ros.cli.campaigning": ("batch",),
+    "omsm_ros.cli.exporting": ("export",),
 }
 
 # What stands after "--" is for the command that these run in turn.

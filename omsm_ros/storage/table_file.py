@@ -6,6 +6,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,11 +49,20 @@ def numbers_in(body: str, what: str, places: Sequence[int] | None = None) -> Flo
 
     Raises FileError, which calls the text ``what``, for anything but numbers.
     """
+    remedy = "write a line of names, then numbers"
+    return rows_in(io.StringIO(body), what, remedy, delimiter=",", usecols=places)
+
+
+def rows_in(source: Any, what: str, remedy: str, **layout: Any) -> FloatArray:
+    """Numbers of lines of text, (lines, columns); (0, …) of none.
+
+    source, layout: as numpy.loadtxt takes them
+
+    Raises FileError, which calls the text ``what`` and tells the ``remedy``, for other lines.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that it is empty; the caller says so
-            return np.loadtxt(io.StringIO(body), delimiter=",", usecols=places, ndmin=2)
-    except ValueError as err:
-        raise FileError(
-            f"{what} is no table: {said(err)}; write a line of names, then numbers"
-        ) from err
+            return np.loadtxt(source, ndmin=2, **layout)
+    except (ValueError, OSError) as err:
+        raise FileError(f"{what} is no table: {said(err)}; {remedy}") from err

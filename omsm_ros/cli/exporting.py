@@ -1,0 +1,75 @@
+"""The commands that hand points and maps to other programs: export."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
+from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.errors import FileError
+from omsm_ros.jobs.export_points import export
+from omsm_ros.storage.maps.length_units import LengthUnits, units_of
+from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
+
+
+def unit(text: str) -> LengthUnits:
+    """Argument type: the unit of a file that does not carry it."""
+    try:
+        return units_of(text)
+    except FileError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+UNIT: dict[str, Any] = {
+    "type": unit,
+    "metavar": "UNIT[,HEIGHT_UNIT]",
+    "help": "of files that do not carry it, as mm, or mm,nm",
+}
+
+# -------------------------------------------------------------------------------- export
+
+
+def _declare_export(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("source", type=Path, help="a result folder, a cloud or a map of any format")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .dat (grid sag)",
+    )
+    sub.add_argument("--unit", **UNIT)
+    sub.add_argument(
+        "--spacing", type=number(quantities.SPACING), help="of a map of scattered points [m]"
+    )
+
+
+def _export(args: argparse.Namespace) -> Facts:
+    return {"source": str(args.source), **export(args.source, args.out, args.unit, args.spacing)}
+
+
+def _show_export(facts: Facts) -> None:
+    rows = [("points", str(facts["points"]))]
+    if "resampling" in facts:
+        spacing = " × ".join(f"{part / MILLIMETRE_M:.4g}" for part in facts["spacing"])
+        rows += [
+            ("map", f"{facts['columns']} × {facts['rows']} places of {spacing} mm, "
+                    f"{facts['missing']} without a height"),
+            ("resampling", facts["resampling"]),
+            ("its error", f"at most {facts['interpolation_error'] / NANOMETRE_M:.2g} nm rms"),
+        ]  # fmt: skip
+    table([*rows, ("written to", facts["file"])])
+
+
+COMMANDS = (
+    Command(
+        "export",
+        "write a cloud or map in the format of another program",
+        _declare_export,
+        _export,
+        _show_export,
+    ),
+)

@@ -1,0 +1,1 @@
+"""Do two measurements of one part agree? The same places, the difference, what it is worth."""

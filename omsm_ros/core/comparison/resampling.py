@@ -1,0 +1,319 @@
+"""What is the height between the points that were measured?
+
+A trend, a polynomial of the whole surface, is taken off first. The points are averaged in square
+cells, so that a track of dense points counts no more than its neighbours. At each place a
+quadratic surface is fitted to the cells around it, weighted by their distance (tricube, Cleveland
+1979), and its value there is taken: exact where the surface less its trend is a quadratic within
+one radius. What is shorter than the radius is averaged out. No value is given where the cells do
+not surround the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.errors import DataError
+
+RADIUS_CELLS = 2.4
+"""Radius of a local fit in sides of a cell: some eighteen cells for six coefficients."""
+
+_TREND_DEGREE = 6
+_TREND_POINTS = 20_000
+# Twice as large cells are a quarter as many where the points fill the surface.
+_FILLED = 3.5
+_FEWEST_CELLS_ACROSS = 8
+_LEAST_NEIGHBOURS = 9
+# A place at the straight edge of evenly spread cells has its tricube-weighted centre 0.30 radii
+# inside; farther out than that a fit extrapolates.
+_LARGEST_OFFSET = 0.36
+# The value of a quadratic whose columns are nearly dependent is a guess.
+_WORST_CONDITION = 1e-6
+_PORTION = 20_000
+_WIDER, _PROBED = 1.5, 3_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalHeights:
+    """Heights at places (m,); NaN where the points do not surround a place.
+
+    value: [m];  slope_x, slope_y: [1]
+    independent: standard uncertainty [m] of the value if the points' errors are independent
+    stated: the points' own standard uncertainty there [m]; both NaN where none is stated
+    """
+
+    value: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+    independent: FloatArray
+    stated: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Means of the points in square cells, each (k,).
+
+    xx, xy, yy: mean products of the points' distances from the middle of their cell [m²]
+    variance: mean square of their uncertainty [m²]
+    """
+
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    xx: FloatArray
+    xy: FloatArray
+    yy: FloatArray
+    variance: FloatArray
+    points: FloatArray
+
+
+class LocalQuadratic:
+    """A surface between its points, by local quadratic regression on cells of side ``cell`` [m].
+
+    Raises DataError for points that fill fewer than nine cells.
+    """
+
+    def __init__(self, points: MeasuredPoints, cell: float) -> None:
+        self.cell = cell
+        self._trend = _Trend(points)
+        self._cells = _averaged(points, points.height - self._trend.at(points.x, points.y), cell)
+        if len(self._cells.x) < _LEAST_NEIGHBOURS:
+            raise DataError(
+                f"the points fill {len(self._cells.x)} cells of {cell:.3g} m, too few for a "
+                "surface between them; measure an area, or choose smaller cells"
+            )
+        self._tree = cKDTree(np.column_stack([self._cells.x, self._cells.y]))
+
+    def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
+        """Heights, slopes and their uncertainties at x, y [m], each (m,)."""
+        found = self._fitted(x, y, RADIUS_CELLS * self.cell)
+        tx, ty = self._trend.slopes(x, y)
+        return LocalHeights(
+            value=found[0] + self._trend.at(x, y),
+            slope_x=found[1] + tx,
+            slope_y=found[2] + ty,
+            independent=found[3],
+            stated=found[4],
+        )
+
+    def method_error(self, x: FloatArray, y: FloatArray) -> float:
+        """Rms error of the interpolation at places like x, y (m,) [m], from above.
+
+        The error of a quadratic grows with the fourth power of its radius, and with a lower one
+        where the radius nears the wavelength. With the third, what a radius half as large again
+        changes is 1.5³ − 1 times the error, and noise beside it.
+        """
+        some = slice(None, None, max(len(x) // _PROBED, 1))
+        radius = RADIUS_CELLS * self.cell
+        near, far = (self._fitted(x[some], y[some], r)[0] for r in (radius, _WIDER * radius))
+        change = (far - near)[np.isfinite(far - near)]
+        if not len(change):
+            return float("nan")
+        return float(np.sqrt(np.mean(change**2))) / (_WIDER**3 - 1)
+
+    def _fitted(self, x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
+        """Value, slopes, independent and stated uncertainty less the trend, (5, m)."""
+        parts = [self._portion(x[p], y[p], radius) for p in _portions(len(x))]
+        return np.concatenate([np.empty((5, 0)), *parts], axis=1)
+
+    def _portion(self, x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
+        cells = self._cells
+        most = min(int(4.5 * (radius / self.cell) ** 2) + 8, len(cells.x))
+        distance, index = self._tree.query(
+            np.column_stack([x, y]), k=most, distance_upper_bound=radius
+        )
+        inside = index < len(cells.x)
+        index = np.where(inside, index, 0)
+        weight = np.where(inside, (1 - np.minimum(distance / radius, 1.0) ** 3) ** 3, 0.0)
+        # A cell of many points is no better than the surface is quadratic.
+        weight *= cells.points[index] / (cells.points[index] + np.median(cells.points))
+        u = np.where(inside, (cells.x[index] - x[:, None]) / radius, 0.0)
+        v = np.where(inside, (cells.y[index] - y[:, None]) / radius, 0.0)
+        good = self._surrounded(u, v, weight, inside)
+        moments = [m[index[good]] / radius**2 for m in (cells.xx, cells.xy, cells.yy)]
+        rows = _first_rows(u[good], v[good], moments, weight[good])
+        found = np.full((5, len(x)), np.nan)
+        chosen = index[good]
+        for place, scale in enumerate((1.0, 1 / radius, 1 / radius)):
+            found[place, good] = scale * np.sum(rows[:, place] * cells.height[chosen], axis=1)
+        variance = cells.variance[chosen]
+        share = rows[:, 0]
+        found[3, good] = np.sqrt(np.sum(share**2 * variance / cells.points[chosen], axis=1))
+        near = weight[good] / np.sum(weight[good], axis=1, keepdims=True)
+        found[4, good] = np.sqrt(np.sum(near * variance, axis=1))
+        return found
+
+    @staticmethod
+    def _surrounded(
+        u: FloatArray, v: FloatArray, weight: FloatArray, inside: BoolArray
+    ) -> BoolArray:
+        """Where the cells lie on all sides of the place, and not along one line."""
+        total = np.maximum(weight.sum(axis=1), np.finfo(np.float64).tiny)
+        centre = np.hypot((weight * u).sum(axis=1), (weight * v).sum(axis=1)) / total
+        uu, vv, uv = ((weight * p).sum(axis=1) / total for p in (u * u, v * v, u * v))
+        flat = uu * vv - uv**2 > 1e-3 * (uu + vv) ** 2
+        enough = inside.sum(axis=1) >= _LEAST_NEIGHBOURS
+        return np.asarray(enough & flat & (centre < _LARGEST_OFFSET), np.bool_)
+
+
+def _first_rows(
+    u: FloatArray, v: FloatArray, moments: list[FloatArray], weight: FloatArray
+) -> FloatArray:
+    """Weights of the cells in the value and in both slopes of the local quadratic, (m, 3, k).
+
+    What is fitted to the mean of a cell is the mean of the quadratic over its points.
+    """
+    uu, uv, vv = moments
+    basis = np.stack([np.ones_like(u), u, v, u * u + uu, u * v + uv, v * v + vv], axis=2)
+    weighted = basis * weight[:, :, None]
+    normal = np.einsum("mki,mkj->mij", weighted, basis)
+    scale = np.sqrt(np.einsum("mii->mi", normal))
+    normal /= scale[:, :, None] * scale[:, None, :]
+    lowest = np.linalg.eigvalsh(normal)[:, 0] if len(normal) else np.empty(0)
+    # Where cells lie on two lines only, a little of the identity keeps the value and gives up
+    # the curvature across them.
+    normal += np.where(lowest < _WORST_CONDITION, 1e-4, 0.0)[:, None, None] * np.eye(6)
+    first = np.eye(6)[:, :3] / scale[:, :, None]
+    solved = np.linalg.solve(normal, first) / scale[:, :, None]
+    return np.asarray(np.einsum("mki,mij->mjk", weighted, solved), np.float64)
+
+
+# -------------------------------------------------------------------------------- trend
+
+
+class _Trend:
+    """A polynomial of the whole surface, by least squares."""
+
+    def __init__(self, points: MeasuredPoints) -> None:
+        some = slice(None, None, max(len(points) // _TREND_POINTS, 1))
+        x, y = points.x[some], points.y[some]
+        self._middle = (float(np.mean(x)), float(np.mean(y)))
+        self._scale = float(max(np.ptp(points.x), np.ptp(points.y))) / 2 or 1.0
+        degree = _TREND_DEGREE if len(x) > 10 * len(_powers(_TREND_DEGREE)) else 1
+        self._powers = _powers(degree)
+        self._coefficients = np.linalg.lstsq(self._columns(x, y), points.height[some], rcond=1e-10)[
+            0
+        ]
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Its height [m], (n,)."""
+        parts = [self._columns(x[p], y[p]) @ self._coefficients for p in _portions(len(x))]
+        return np.concatenate([np.empty(0), *parts])
+
+    def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Its slopes [1], each (n,)."""
+        step = 1e-5 * self._scale
+        return (
+            (self.at(x + step, y) - self.at(x - step, y)) / (2 * step),
+            (self.at(x, y + step) - self.at(x, y - step)) / (2 * step),
+        )
+
+    def _columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        u, v = (x - self._middle[0]) / self._scale, (y - self._middle[1]) / self._scale
+        powers_u, powers_v = ([np.ones_like(x)], [np.ones_like(x)])
+        for _ in range(max(i + j for i, j in self._powers)):
+            powers_u.append(powers_u[-1] * u)
+            powers_v.append(powers_v[-1] * v)
+        return np.stack([powers_u[i] * powers_v[j] for i, j in self._powers], axis=1)
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
+
+
+# -------------------------------------------------------------------------------- cells
+
+
+def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
+    """Return the least side [m] of cells that points (n,) fill, no more than ``most`` across."""
+    wide, high = float(np.ptp(x)), float(np.ptp(y))
+    extent = max(wide, high)
+    if min(wide, high) <= 0:
+        raise DataError(
+            f"the points cover {wide:.3g} × {high:.3g} m, which is no area; a profile cannot be "
+            "made into a map"
+        )
+    side = max(float(np.sqrt(wide * high / len(x))), extent / most)
+    while extent / side > _FEWEST_CELLS_ACROSS:
+        if _occupied(x, y, side) >= _FILLED * _occupied(x, y, 2 * side):
+            break
+        side *= 2 ** (1 / 2)
+    return side
+
+
+def _occupied(x: FloatArray, y: FloatArray, side: float) -> int:
+    column, row = _place(x, side), _place(y, side)
+    return int(np.count_nonzero(np.bincount(column * (int(row.max()) + 1) + row)))
+
+
+def _place(values: FloatArray, side: float) -> IntArray:
+    return np.asarray(np.floor((values - values.min()) / side), np.int64)
+
+
+def _averaged(points: MeasuredPoints, height: FloatArray, side: float) -> _Cells:
+    column, row = _place(points.x, side), _place(points.y, side)
+    _, cell, count = np.unique(
+        column * (int(row.max()) + 1) + row, return_inverse=True, return_counts=True
+    )
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(cell, values, len(count)) / count, np.float64)
+
+    x, y = mean(points.x), mean(points.y)
+    dx, dy = points.x - x[cell], points.y - y[cell]
+    spread = np.full(len(points), np.nan) if points.uncertainty is None else points.uncertainty
+    return _Cells(
+        x=x,
+        y=y,
+        height=mean(height),
+        xx=mean(dx * dx),
+        xy=mean(dx * dy),
+        yy=mean(dy * dy),
+        variance=mean(spread**2),
+        points=count.astype(np.float64),
+    )
+
+
+def _portions(count: int) -> Iterator[slice]:
+    for start in range(0, count, _PORTION):
+        yield slice(start, start + _PORTION)
+
+
+# --------------------------------------------------------------------------------- grid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resampled:
+    """A map made of scattered points, and how.
+
+    grid: heights [m];  method_error: rms error of the interpolation [m], from above
+    """
+
+    grid: HeightGrid
+    method_error: float
+
+
+def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> Resampled:
+    """Return the points as a map of at most ``most`` columns or rows, as fine as they allow.
+
+    spacing: of the map [m] instead
+
+    Raises DataError for points that are no area, or a spacing that makes too large a map.
+    """
+    side = spacing or cell_side(points.x, points.y, most)
+    shape = tuple(int(np.floor(np.ptp(v) / side)) + 1 for v in (points.y, points.x))
+    if max(shape) > max(most, 20_000) or shape[0] * shape[1] > 25_000_000:
+        raise DataError(f"a spacing of {side:.3g} m makes a map of {shape!r} places; widen it")
+    x0, y0 = (float(v.min() + (np.ptp(v) % side) / 2) for v in (points.x, points.y))
+    empty = HeightGrid(height=np.zeros(shape), x0=x0, y0=y0, dx=side, dy=side)
+    x, y = (part.ravel() for part in np.meshgrid(empty.x, empty.y))
+    surface = LocalQuadratic(points, side)
+    height = surface.at(x, y).value.reshape(shape)
+    grid = HeightGrid(height=height, x0=x0, y0=y0, dx=side, dy=side)
+    return Resampled(grid, surface.method_error(x, y))

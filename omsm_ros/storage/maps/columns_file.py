@@ -1,0 +1,177 @@
+"""Text with a column each for x, y and height: ``.xyz``, ``.asc``, ``.csv``, ``.txt``."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import open_regular, whole_file
+from omsm_ros.storage.maps.length_units import LengthUnits, name_and_unit, needed
+from omsm_ros.storage.table_file import rows_in
+
+# Twenty million lines of three numbers.
+MAX_TEXT_BYTES = 2_000_000_000
+_COMMENTS = ("#", "!", "%")
+_LONGEST_HEADER, _LONGEST_LINE = 50, 10_000
+_ROLES = {
+    "x": "x",
+    "y": "y",
+    "z": "height",
+    "height": "height",
+    "sag": "height",
+    "uncertainty": "uncertainty",
+    "u": "uncertainty",
+    "sample": "sample",
+}
+_PORTION = 100_000
+
+
+def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    """Read a text of points; its units from its header, or ``units`` where it names none.
+
+    Raises FileError for a text that is no table of points, or names no unit and none is given.
+    """
+    what = f"map {str(path)!r}"
+    with open_regular(path, FileError, "map") as stream:
+        if (size := stream.seek(0, io.SEEK_END)) > MAX_TEXT_BYTES:
+            raise FileError(f"{what} has {size} bytes, at most {MAX_TEXT_BYTES} are read; thin it")
+        stream.seek(0)
+        header, first = _beginning(stream, what)
+        names, scales = _columns(header, first, units, what)
+        stream.seek(0)
+        body = io.TextIOWrapper(stream, encoding="utf-8", errors="replace")
+        table = _numbers(body, len(header), _delimiter(first), sorted(names.values()), what)
+    at = {name: sorted(names.values()).index(place) for name, place in names.items()}
+    column = {name: table[:, place] * scales[name] for name, place in at.items()}
+    return _points(column, _notes(names, first))
+
+
+def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
+    """Return the lines before the first line of numbers, and that line."""
+    header: list[str] = []
+    for raw in islice(iter(lambda: stream.readline(_LONGEST_LINE), b""), _LONGEST_HEADER):
+        line = raw.decode("utf-8", "replace").strip()
+        if line and not line.startswith(_COMMENTS) and _all_numbers(line):
+            return header, line
+        header.append(line)
+    raise FileError(
+        f"{what} has no line of numbers among its first {_LONGEST_HEADER}; give a text with a "
+        "column each for x, y and height"
+    )
+
+
+def _all_numbers(line: str) -> bool:
+    parts = [part for part in re.split(r"[,;\s]+", line) if part]
+    try:
+        [float(part) for part in parts]
+    except ValueError:
+        return False
+    return bool(parts)
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ";," if mark in line), None)
+
+
+def _columns(
+    header: list[str], first: str, units: LengthUnits | None, what: str
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Return the place of each column by its role, and metres in one of its numbers."""
+    count = len([part for part in re.split(r"[,;]|\s+", first.strip("; ,")) if part])
+    named = next(filter(None, (_named(line, count) for line in reversed(header))), {})
+    places = {role: place for role, (place, _) in named.items()}
+    if not named:
+        if count < 3:
+            raise FileError(f"{what} has {count} columns, expected x, y and height")
+        places = {"x": 0, "y": 1, "height": 2}
+    stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
+    scales = dict.fromkeys(places, 1.0)
+    for role in places:
+        if role == "sample":
+            continue
+        if role in stated:
+            scales[role] = stated[role]
+        else:
+            given = needed(units, what)
+            scales[role] = given.lateral if role in "xy" else given.height
+    return places, scales
+
+
+def _named(line: str, count: int) -> dict[str, tuple[int, float | None]]:
+    """Return place and unit of each column by its role, if the line names x, y and a height."""
+    text = line.lstrip("#!% ").replace("/t", "\t")
+    parts = [part for part in re.split(r"[,;\t]", text) if part.strip()]
+    if len(parts) < 3:
+        parts = re.sub(r"\s+(?=[\[(])", "", text).split()
+    known = [name_and_unit(part) for part in parts]
+    found: dict[str, tuple[int, float | None]] = {}
+    for place, (name, unit) in enumerate(known):
+        role = _ROLES.get(name)
+        # A cloud of ours has its height twice, and "height" is the one of full precision.
+        if role and (role not in found or name == "height"):
+            found[role] = (place, unit)
+    whole = {"x", "y", "height"} <= set(found) and len(parts) == count
+    return found if whole else {}
+
+
+def _numbers(
+    body: io.TextIOBase, skip: int, delimiter: str | None, columns: list[int], what: str
+) -> FloatArray:
+    remedy = (
+        "write decimal points, a height that is missing as nan, and the same columns on every line"
+    )
+    layout = {"comments": list(_COMMENTS), "delimiter": delimiter, "usecols": columns}
+    return rows_in(body, what, remedy, skiprows=skip, **layout)
+
+
+def _notes(names: Mapping[str, int], first: str) -> tuple[str, ...]:
+    count = len([part for part in re.split(r"[,;\s]+", first) if part])
+    return (f"{count - len(names)} other columns were left out",) if count > len(names) else ()
+
+
+def _points(column: Mapping[str, FloatArray], notes: tuple[str, ...]) -> MeasuredPoints:
+    points = measured(column["x"], column["y"], column["height"], column.get("uncertainty"), notes)
+    if "sample" not in column:
+        return points
+    order = column["sample"][np.isfinite(column["height"])].astype(np.int64)
+    return MeasuredPoints(
+        x=points.x,
+        y=points.y,
+        height=points.height,
+        uncertainty=points.uncertainty,
+        sample=order,
+        missing=points.missing,
+        notes=notes,
+    )
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv: bool) -> None:
+    """Write columns (n,) of one length by their names, as CSV or, for xyz, after a ``#`` line."""
+    mark = "," if csv else " "
+    with whole_file(path, "w") as stream:
+        stream.write(("" if csv else "# ") + mark.join(columns) + "\n")
+        for portion in _portions(columns):
+            np.savetxt(stream, portion, fmt=_formats(columns), delimiter=mark)
+
+
+def _formats(columns: Mapping[str, NDArray[np.generic]]) -> list[str]:
+    """As many digits as each kind of number holds."""
+    return [
+        "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
+        for part in columns.values()
+    ]
+
+
+def _portions(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[NDArray[np.float64]]:
+    count = len(next(iter(columns.values())))
+    for start in range(0, count, _PORTION):
+        yield np.column_stack([part[start : start + _PORTION] for part in columns.values()])

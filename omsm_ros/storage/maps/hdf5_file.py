@@ -1,0 +1,122 @@
+"""HDF5: our own tables of points, and the maps of Zygo Mx (``.datx``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import open_regular, said, whole_file
+from omsm_ros.storage.maps.length_units import metres_in
+from omsm_ros.storage.maps.optional import library
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+SCHEMA = "omsm-points/1"
+_MOST_POINTS = 50_000_000
+_NO_LENGTHS = ("sample", "intensity")
+_DATX_SURFACES = "Data/Surface"
+
+
+def read_hdf5(path: Path) -> MeasuredPoints:
+    """Read a table of ours, or the first surface of a ``.datx``; both carry their units.
+
+    Raises FileError for other HDF5 files, and for those that are damaged.
+    """
+    what = f"HDF5 file {str(path)!r}"
+    h5py = library("h5py", what)
+    with open_regular(path, FileError, "HDF5 file") as stream:
+        try:
+            with h5py.File(stream, "r") as content:
+                if content.attrs.get("schema") == SCHEMA:
+                    return _table(content, what)
+                if _DATX_SURFACES in content:
+                    return _datx(h5py, content, what)
+        except (OSError, KeyError, TypeError, IndexError, ValueError, RuntimeError) as err:
+            if isinstance(err, FileError):
+                raise
+            raise FileError(f"{what} cannot be read: {said(err)}; is it cut short?") from err
+    raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
+
+
+def _table(content: Any, what: str) -> MeasuredPoints:
+    column: dict[str, NDArray[Any]] = {}
+    for name in ("x", "y", "height", "uncertainty", "sample"):
+        if name in content:
+            column[name] = _array(content[name], what, 1)
+    known = np.isfinite(column["height"])
+    points = measured(column["x"], column["y"], column["height"], column.get("uncertainty"))
+    return MeasuredPoints(
+        x=points.x,
+        y=points.y,
+        height=points.height,
+        uncertainty=points.uncertainty,
+        sample=column["sample"][known].astype(np.int64) if "sample" in column else None,
+        missing=points.missing,
+    )
+
+
+def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
+    shape = getattr(dataset, "shape", ())
+    if len(shape) != axes or np.prod(shape, dtype=float) > _MOST_POINTS:
+        raise FileError(f"{what} holds heights of shape {shape!r}; at most {_MOST_POINTS} are read")
+    return np.asarray(dataset[()])
+
+
+# ---------------------------------------------------------------------------------- .datx
+
+
+def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
+    group = content[_DATX_SURFACES]
+    surfaces = [group[name] for name in group if isinstance(group[name], h5py.Dataset)]
+    if not surfaces:
+        raise FileError(f"{what} holds no surface")
+    surface = surfaces[0]
+    height = _array(surface, what, 2).astype(np.float64)
+    no_data = surface.attrs.get("No Data")
+    if no_data is not None:
+        height[height >= float(np.ravel(no_data)[0])] = np.nan
+    dx, dy = (_pixel(surface, f"{axis} Converter", what) for axis in "XY")
+    # The first row is the upper one of the camera.
+    scaled = np.flipud(height) * _datx_scale(surface, what)
+    notes = (f"the first of its {len(surfaces)} surfaces",) if len(surfaces) > 1 else ()
+    return HeightGrid(height=scaled, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
+
+
+def _datx_scale(surface: Any, what: str) -> float:
+    """Metres in one unit of the heights."""
+    unit = np.ravel(surface.attrs["Unit"])[0]
+    name = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    if (metres := metres_in(name)) is not None:
+        return metres
+    if name.lower() not in ("fringes", "waves", "fringewaves"):
+        raise FileError(f"{what} has heights in {name!r}, expected a length or fringes")
+    keys = ("Wavelength", "Interferometric Scale Factor", "Obliquity Factor")
+    return float(np.prod([np.ravel(surface.attrs[key])[0] for key in keys]))
+
+
+def _pixel(surface: Any, key: str, what: str) -> float:
+    """Metres between pixels: the second number of a converter from pixels."""
+    category, base, *_, numbers = np.ravel(surface.attrs[key])[0]
+    if (category, base) != (b"LateralCat", b"Pixels") or not numbers[1] > 0:
+        raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
+    return float(numbers[1])
+
+
+# ------------------------------------------------------------------------------- writing
+
+
+def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:
+    """Write columns (n,) as datasets with their ``units``, lengths in metres."""
+    h5py = library("h5py", f"writing {str(path)!r}")
+    with whole_file(path, "w+b") as stream, h5py.File(stream, "w") as content:
+        content.attrs["schema"] = SCHEMA
+        content.attrs["comment"] = comment
+        for name, values in columns.items():
+            dataset = content.create_dataset(name, data=values)
+            dataset.attrs["units"] = "1" if name in _NO_LENGTHS else "m"

@@ -1,0 +1,64 @@
+"""Which format is this file? Read it as points in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.storage.files import CLOUD, open_regular
+from omsm_ros.storage.maps import hdf5_file, metropro_file
+from omsm_ros.storage.maps.columns_file import read_columns
+from omsm_ros.storage.maps.dabam_file import has_dabam_header, read_dabam
+from omsm_ros.storage.maps.foreign_file import read_foreign
+from omsm_ros.storage.maps.grid_sag_file import is_grid_sag, read_grid_sag
+from omsm_ros.storage.maps.length_units import LengthUnits
+from omsm_ros.storage.maps.vertex_file import read_pcd, read_ply
+from omsm_ros.storage.maps.x3p_file import read_x3p
+
+_HEAD_BYTES = 4096
+_GRID_SAG_SUFFIXES = (".dat", ".grd")
+_TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
+
+
+def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
+    """Read a map or cloud of any known format, told by its content; a folder is a result of ours.
+
+    units: of a file that does not carry them itself
+
+    Raises FileError for a file that is of no known format, is damaged, or needs ``units``.
+    """
+    file = path / CLOUD if path.is_dir() else path
+    try:
+        return _read(file, units)
+    except DataError as err:
+        raise FileError(f"map {str(file)!r}: {err}") from err
+
+
+def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    with open_regular(path, FileError, "map") as stream:
+        head = stream.read(_HEAD_BYTES)
+    if not head:
+        raise FileError(f"map {str(path)!r} is empty")
+    if head.startswith((b"ply\n", b"ply\r\n")):
+        return read_ply(path, units)
+    if head.startswith((b"# .PCD", b"VERSION")):
+        return read_pcd(path, units)
+    if head.startswith(metropro_file.MAGIC):
+        return metropro_file.read_metropro(path)
+    if head.startswith(hdf5_file.MAGIC):
+        return hdf5_file.read_hdf5(path)
+    if path.suffix.lower() == ".x3p":
+        return read_x3p(path)
+    if has_dabam_header(path):
+        return read_dabam(path)
+    if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
+        return read_foreign(path, units)
+    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(_first_data_line(head)):
+        return read_grid_sag(path).points()
+    return read_columns(path, units)
+
+
+def _first_data_line(head: bytes) -> str:
+    lines = head.decode("utf-8", "replace").splitlines()
+    return next((line for line in lines if line.strip() and not line.startswith("!")), "")

@@ -1,0 +1,84 @@
+"""x3p (ISO 25178-72): a map, a profile or a cloud with its axes, in metres.
+
+Written in the revision ``ISO5436 - 2000``, which every reader takes.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import open_regular, said, whole_file
+from omsm_ros.storage.maps.optional import library
+
+# Fifty million heights of eight bytes, unpacked.
+MAX_UNPACKED_BYTES = 400_000_000
+
+
+def read_x3p(path: Path) -> MeasuredPoints:
+    """Read the first layer of an x3p file, in its global frame.
+
+    Raises FileError for a file that is none, is damaged, or unpacks to more than is read.
+    """
+    what = f"x3p file {str(path)!r}"
+    x3pio = library("x3pio", what)
+    with open_regular(path, FileError, "x3p file") as stream:
+        try:
+            with zipfile.ZipFile(stream) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+            if size > MAX_UNPACKED_BYTES:
+                raise FileError(
+                    f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read"
+                )
+            stream.seek(0)
+            content = x3pio.read(stream)
+            place = _places(x3pio, content)
+        except (x3pio.X3pError, zipfile.BadZipFile, ValueError, OSError, EOFError) as err:
+            if isinstance(err, FileError):
+                raise
+            raise FileError(f"{what} cannot be read: {said(err)}") from err
+    layers = len(content.layers)
+    notes = (f"the first of its {layers} layers",) if layers > 1 else ()
+    return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
+
+
+def _places(x3pio: Any, content: Any) -> FloatArray:
+    """Return x, y, height (n, 3) [m] of the first layer; NaN = missing."""
+    layer, header = content.layers[0], content.header
+    if isinstance(content, x3pio.PointCloud):
+        places = np.asarray(layer.points(), np.float64)
+    elif not header.x.is_incremental or (np.ndim(layer.z) == 2 and not header.y.is_incremental):
+        raise ValueError("its places are listed one by one; save it with even spacings")
+    else:
+        height = np.atleast_2d(np.asarray(layer.z, np.float64))
+        dx = header.x.increment
+        dy = header.y.increment if np.ndim(layer.z) == 2 else dx
+        grid = HeightGrid(height=height, x0=0.0, y0=0.0, dx=dx, dy=dy)
+        x, y = np.meshgrid(grid.x, grid.y)
+        places = np.column_stack([x.ravel(), y.ravel(), height.ravel()])
+    if content.placement is None:
+        return places
+    return np.asarray(content.placement.apply(places), np.float64)
+
+
+def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
+    """Write a map [m] with its place as x3p of the revision that all readers take."""
+    x3pio = library("x3pio", f"writing {str(path)!r}")
+    surface = x3pio.Surface.from_array(
+        grid.height,
+        x_scale=grid.dx,
+        y_scale=grid.dy,
+        placement=x3pio.Placement(offset=(grid.x0, grid.y0, 0.0)),
+        coordinate_system=x3pio.CoordinateSystem.VIEW,
+        revision=x3pio.Revision.ISO5436_2000,
+    )
+    named = surface.with_metadata(manufacturer="omsm_ros", model="omsm_ros", comment=comment)
+    with whole_file(path) as stream:
+        named.save(stream)
