@@ -12,22 +12,32 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
-from omsm_ros.core.correction.uncertainty import sources_with
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits, ScanPath
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.readable import percent, plain, quantity
+from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
 from omsm_ros.storage.machine_files import load_geometry, load_limits, load_surface
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.sources_file import load_sources
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
+
+
+def sources_of(text: str) -> MachineSources:
+    """Return what is uncertain of the machine: from a file, or from JSON that stands there."""
+    if text.lstrip().startswith("{"):
+        return declared_sources(strict_json.object_of(text, ConfigurationError, "--sources"))
+    return load_sources(text) if text else MachineSources()
 
 
 def geometry_of(path: Path | None) -> Geometry:
@@ -71,10 +81,14 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--sources",
-        type=json_object,
-        default={},
-        metavar="JSON",
-        help='other standard uncertainties, e.g. {"encoder_noise": 4e-10}',
+        default="",
+        metavar="SOURCES.yaml",
+        help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
+    )
+    sub.add_argument(
+        "--accuracy",
+        type=number(quantities.BUDGET),
+        help="asked for, k = 2 [m]: what the traffic light is held against",
     )
     sub.add_argument(
         "--lateral",
@@ -110,7 +124,6 @@ def _correct(args: argparse.Namespace) -> Facts:
         accept_other_rate=args.override,
         lateral_lag=args.lateral_lag,
         geometry=geometry_of(args.geometry),
-        sources=sources_with(calibration, args.sources),
     )
     with (
         result_folder(args.out, (CLOUD, REPORT, SUMMARY)) as out,
@@ -125,6 +138,8 @@ def _correct(args: argparse.Namespace) -> Facts:
             admission=Admission(args.settings, args.override),
             lateral=args.lateral,
             by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
+            stated=sources_of(args.sources),
+            accuracy=args.accuracy,
             report=not args.no_report,
             progress=progress,
         )
@@ -136,6 +151,9 @@ def _show_correct(summary: Facts) -> None:
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
         text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         rows.append((stream, text))
+    light = summary["light"]
+    rows.append((light["level"], light["word"]))
+    rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
     rows += [("warning", text) for text in summary.get("warnings", [])]
     table([*rows, ("written", ", ".join(summary["files"].values()))])
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -38,6 +39,7 @@ class Correction:
     statistics: of the dynamic "error", and with a nominal surface of the "raw" and "corrected"
         deviation, over all points; empty without points
     largest_uncertainty: [m];  points: evenly chosen, as in the cloud
+    trace: points that stand for the scan where its systematic errors are judged
     path: its start, None without axes
     sample_period: [s]
     """
@@ -50,6 +52,7 @@ class Correction:
     statistics: dict[str, FormStatistics]
     largest_uncertainty: float
     points: NDArray[np.void]
+    trace: ScanTrace
     path: ScanPath | None
     sample_period: float
 
@@ -136,6 +139,7 @@ def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
         statistics=found.statistics(),
         largest_uncertainty=found.largest,
         points=found.drawn.rows(),
+        trace=scan.trace,
         path=found.path.path(),
         sample_period=scan.sample_period,
     )

@@ -12,6 +12,7 @@ from typing import Any
 
 from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.accounts import Account, Reason
@@ -127,6 +128,11 @@ class CorrectedScan:
     def budget(self) -> dict[str, float]:
         """Standard uncertainty of the heights by its source [m], rms of all points so far."""
         return self._corrector.budget
+
+    @property
+    def trace(self) -> ScanTrace:
+        """Points that stand for the scan so far."""
+        return self._corrector.trace
 
     @property
     def stamp_skew(self) -> float | None:

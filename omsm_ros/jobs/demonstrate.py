@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
@@ -24,6 +26,7 @@ from omsm_ros.errors import OmsmError
 from omsm_ros.jobs import measure as measurement
 from omsm_ros.jobs import publish as publication
 from omsm_ros.jobs.correct_bag import correct_bag
+from omsm_ros.jobs.judge_scan import Judgement, with_sources
 from omsm_ros.readable import quantity
 from omsm_ros.report.common import response_figures, style
 from omsm_ros.report.measurement.cloud_view import CloudView
@@ -150,14 +153,17 @@ _RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
 def conclude(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
-    done = correct_bag(plan.bag, calibration, plan.out / CLOUD, nominal=PAPER_MIRROR)
+    options = with_sources(CorrectionOptions(), calibration, NOTHING_STATED, PAPER_MIRROR)
+    done = correct_bag(
+        plan.bag, calibration, plan.out / CLOUD, options=options, nominal=PAPER_MIRROR
+    )
     cloud = CloudFile(plan.out / CLOUD).read()
     view = publication.view_of(cloud, plan.sample_period)
     if view is None:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = step_test_of(plan.scenario, plan.disturbances)
-    summary = measurement.summarise(plan.bag, done, calibration)
+    summary = measurement.summarise(plan.bag, done, calibration, Judgement(options))
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before

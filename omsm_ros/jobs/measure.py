@@ -12,6 +12,7 @@ import numpy as np
 
 from omsm_ros import __version__
 from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
@@ -21,6 +22,7 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
+from omsm_ros.jobs.judge_scan import Judgement, with_sources
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
 
@@ -35,6 +37,8 @@ def measure(
     admission: Admission | None = None,
     lateral: float = 0.0,
     by_stamps: ByStamps | None = None,
+    stated: MachineSources = NOTHING_STATED,
+    accuracy: float | None = None,
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -42,22 +46,24 @@ def measure(
 
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
+    stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
     """
+    used = with_sources(options or CorrectionOptions(), calibration, stated, nominal)
     done = correct_bag(
         bag,
         calibration,
         out / CLOUD,
-        options=options,
+        options=used,
         admission=admission,
         nominal=nominal,
         lateral=lateral,
         by_stamps=by_stamps,
         progress=progress,
     )
-    summary = summarise(bag, done, calibration)
+    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy))
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
@@ -70,7 +76,9 @@ def measure(
     return summary
 
 
-def summarise(bag: Path, done: Correction, calibration: Calibration) -> dict[str, Any]:
+def summarise(
+    bag: Path, done: Correction, calibration: Calibration, judgement: Judgement
+) -> dict[str, Any]:
     """What ``summary.json`` says of every measurement; lengths in metres."""
     summary: dict[str, Any] = {
         "schema": "omsm-summary/1",
@@ -95,7 +103,8 @@ def summarise(bag: Path, done: Correction, calibration: Calibration) -> dict[str
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
-    return summary | judged | _figures_of_merit(done)
+    audited = judged.get("discretisation", {}).get("rms", 0.0)
+    return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, audited)
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:

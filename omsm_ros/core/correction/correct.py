@@ -13,12 +13,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.correction.motion_filter import MotionFilter, MotionFilters
+from omsm_ros.core.correction.motion_filter import MOVED, RATE, MotionFilter, MotionFilters
+from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import Arrival
@@ -42,6 +45,9 @@ class CorrectionOptions:
     lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
         None takes the latency that the calibration's certificate states
     geometry: where the probe sits and looks
+    systematic: what else is uncertain of the whole scan; into each point's uncertainty goes what
+        can be known of it there: what shifts points sideways, only with a ``surface``
+    surface: nominal, for its slopes
     """
 
     polarity: int = 1
@@ -51,6 +57,8 @@ class CorrectionOptions:
     sources: ErrorSources | None = None
     lateral_lag: float | None = None
     geometry: Geometry = field(default_factory=Geometry)
+    systematic: tuple[SystematicSource, ...] = ()
+    surface: Surface | None = None
 
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
@@ -64,6 +72,8 @@ class CorrectionOptions:
 
 class Corrector:
     """Turns axis and distance blocks into surface points, in the order of their triggers.
+
+    trace: some of the points, evenly chosen, for what acts on the whole scan
 
     Push the two streams about as they came: what waits longer than ``max_pending`` for its
     partner is given up, so that memory stays bounded. Each may also come as one block.
@@ -90,6 +100,12 @@ class Corrector:
         self._variance: defaultdict[str, float] = defaultdict(float)
         self._ready: list[SurfacePoints] = []
         self._stamp_skew: float | None = None
+        self._systematic = [
+            source
+            for source in options.systematic
+            if options.surface is not None or not source.needs_slope
+        ]
+        self.trace = ScanTrace()
 
     def push_axes(self, block: AxisBlock) -> None:
         """Filter the encoder's samples of a block.
@@ -185,7 +201,6 @@ class Corrector:
             self._calibration,
             period,
             lateral_lag(self._calibration, self._options),
-            self._sources.lateral_lag,
         )
         self._noise_gain = filters.height.noise_gain
         return MotionFilter(filters)
@@ -204,38 +219,37 @@ class Corrector:
             good = (axes.reasons | distance.reasons) == Reason.NONE
             sample = sample[good]
             axis_values, probe_values = axis_values[:, good], probe_values[:, good]
-        x, y, b, c, moved, dynamic_error, dynamics, timing = axis_values
+        x, y, b, c, dynamic_error, moved = axis_values[:RATE]
         reading, intensity = probe_values
-        where = workpiece_points(
-            self._options.geometry,
-            (x, y, moved),
-            b,
-            c,
-            reading * (self._options.polarity / self._static_gain),
-        )
+        away = reading * (self._options.polarity / self._static_gain)
+        where = workpiece_points(self._options.geometry, (x, y, moved), b, c, away)
+        time = np.asarray(sample * (axes.period_ns / NANOSECONDS_PER_S), np.float64)
+        points = self.trace.add(axes.session, time, where, c, axis_values[MOVED:], away)
         return SurfacePoints(
             sample=sample,
             x=where.x,
             y=where.y,
             height=where.height,
             dynamic_error=dynamic_error,
-            uncertainty=self._uncertainty(reading, dynamics, timing),
+            uncertainty=self._uncertainty(reading, points),
             intensity=intensity.astype(np.float32),
             stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
 
-    def _uncertainty(
-        self, reading: FloatArray, dynamics: FloatArray, timing: FloatArray
-    ) -> FloatArray:
+    def _uncertainty(self, reading: FloatArray, points: ScanPoints) -> FloatArray:
         variances = contributions(
             self._sources,
             self._noise_gain,
             self._static_gain,
             reading,
-            dynamics,
-            timing,
+            np.sum(points.dynamics**2, axis=0),
+            points.z_rate,
             self._options.geometry.abbe_arm,
         )
+        if self._systematic and self._options.surface is not None:
+            points = points.with_slopes(self._options.surface)
+        for source in self._systematic:
+            variances[source.name] = variances.get(source.name, 0.0) + source.variance(points)
         for name, variance in variances.items():
             common = isinstance(variance, float)
             self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)

@@ -27,15 +27,17 @@ SETTLED = 1e-6
 _MIN_START_SAMPLES = 12
 _X, _Y, _Z, _B, _C = range(5)
 _LATERAL = (_X, _Y, _B, _C)
-_OUTPUTS = 8
+# Rows of what comes out: x, y, b, c, z - H(z), H(z), rate of H(z); sensitivities follow.
+ERROR, MOVED, RATE, SENSITIVITIES = 4, 5, 6, 7
 
 
 @dataclass(frozen=True, eq=False)
 class MotionFilters:
     """The filters that run over the axes.
 
-    height: H on z;  dynamics: F_r on z, variance of H(z) from the covariance
-    timing: on z, H(z) per unit standard uncertainty of the sideways lag
+    height: H on z;  rate: on z, the rate of H(z)
+    dynamics: F_r on z, change of H(z) per standard uncertainty of each direction r of the
+        calibration's covariance
     lateral: on x, y, b, c, where the lag is latency; None where it is not
     forgotten: samples after which the poles of G have forgotten a wrong start
     past: what the filters of ``dynamics`` take for the past of their first samples
@@ -43,7 +45,7 @@ class MotionFilters:
 
     height: DigitalFilter
     dynamics: list[DigitalFilter]
-    timing: DigitalFilter | None
+    rate: DigitalFilter
     lateral: DigitalFilter | None
     forgotten: int = 2**31
     past: Callable[[FloatArray], FloatArray] = past_motion
@@ -54,20 +56,16 @@ class MotionFilters:
         calibration: Calibration,
         sample_period: float,
         lateral_lag: float = 0.0,
-        lateral_lag_uncertainty: float = 0.0,
         order: int = DEFAULT_ORDER,
     ) -> MotionFilters:
         """The filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
-        rate = np.append(0.0, g.numerator) * lateral_lag_uncertainty
-        timing = None
-        if lateral_lag_uncertainty > 0:
-            timing = derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles())
+        rate = np.append(0.0, g.numerator)
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
         return cls(
             height=discretise(g, sample_period, order),
             dynamics=sensitivity_filters(calibration, sample_period),
-            timing=timing,
+            rate=derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles()),
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
             forgotten=forgotten_after(g, sample_period),
             past=past_of(calibration),
@@ -106,14 +104,15 @@ def forgotten_after(dynamics: TransferFunction, sample_period: float) -> int:
 class MotionFilter:
     """Turns runs of axis channels x, y, z, b, c into runs of
 
-    x, y, b, c, H(z), z - H(z), and the variance of H(z) from dynamics and from timing.
+    x, y, b, c, z - H(z), H(z), the rate of H(z), and the changes of H(z) per standard
+    uncertainty of each direction of the calibration's covariance.
     """
 
     def __init__(self, filters: MotionFilters) -> None:
         self._height = Recursion(filters.height)
         self._dynamics = [Recursion(f) for f in filters.dynamics]
         self._past = filters.past
-        self._timing = Recursion(filters.timing) if filters.timing else None
+        self._rate = Recursion(filters.rate)
         self._lateral = (
             {axis: Recursion(filters.lateral) for axis in _LATERAL} if filters.lateral else {}
         )
@@ -142,7 +141,7 @@ class MotionFilter:
             if finite[start]:
                 done += self._push_finite(piece)
             else:
-                done += [*self._break(), _unfiltered(piece, Reason.INVALID)]
+                done += [*self._break(), self._unfiltered(piece, Reason.INVALID)]
         return done
 
     def end(self) -> list[Run]:
@@ -153,7 +152,7 @@ class MotionFilter:
     def _break(self) -> list[Run]:
         short, self._waiting = self._waiting, []
         self._unsettled = self._settling
-        return [_unfiltered(run, Reason.SETTLING) for run in short]
+        return [self._unfiltered(run, Reason.SETTLING) for run in short]
 
     def _push_finite(self, run: Run) -> list[Run]:
         if self._unsettled < self._settling:
@@ -167,7 +166,7 @@ class MotionFilter:
 
     def _start(self, first: FloatArray) -> None:
         motion = past_motion(first[_Z].copy())
-        for recursion in (self._height, *filter(None, [self._timing])):
+        for recursion in (self._height, self._rate):
             recursion.start(motion)
         for recursion in self._dynamics:
             recursion.start(self._past(first[_Z].copy()))
@@ -176,28 +175,30 @@ class MotionFilter:
 
     def _filtered(self, run: Run) -> Run:
         z = run.values[_Z]
-        out = np.zeros((_OUTPUTS, len(run)))
+        out = np.empty((self._outputs, len(run)))
         for row, axis in enumerate(_LATERAL):
             samples = run.values[axis]
             out[row] = self._lateral[axis].run(samples) if self._lateral else samples
-        out[4] = self._height.run(z)
-        out[5] = z - out[4]
-        for recursion in self._dynamics:
-            out[6] += recursion.run(z) ** 2
-        if self._timing:
-            out[7] = self._timing.run(z) ** 2
+        out[MOVED] = self._height.run(z)
+        out[ERROR] = z - out[MOVED]
+        out[RATE] = self._rate.run(z)
+        for row, recursion in enumerate(self._dynamics, SENSITIVITIES):
+            out[row] = recursion.run(z)
         reasons = np.zeros(len(run), np.uint8)
         reasons[: self._unsettled] = Reason.SETTLING
         self._unsettled = max(self._unsettled - len(run), 0)
         return Run(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
 
+    @property
+    def _outputs(self) -> int:
+        return SENSITIVITIES + len(self._dynamics)
 
-def _unfiltered(run: Run, reason: Reason) -> Run:
-    return Run(
-        run.session,
-        run.first,
-        run.stamp_ns,
-        run.period_ns,
-        np.full(len(run), reason, np.uint8),
-        np.full((_OUTPUTS, len(run)), np.nan),
-    )
+    def _unfiltered(self, run: Run, reason: Reason) -> Run:
+        return Run(
+            run.session,
+            run.first,
+            run.stamp_ns,
+            run.period_ns,
+            np.full(len(run), reason, np.uint8),
+            np.full((self._outputs, len(run)), np.nan),
+        )

@@ -29,6 +29,7 @@ class SourceKind:
     says: what its standard uncertainty is of;  quantity: of that, with its unit
     fields: change of each height [m] per unit, (k, n), by the parameters
     parameters: further quantities by name;  optional: those that may be left out
+    squares: sum of the squares of the fields, (n,), where that is had with less work
     """
 
     says: str
@@ -37,6 +38,7 @@ class SourceKind:
     parameters: Mapping[str, Quantity] = field(default_factory=dict)
     optional: tuple[str, ...] = ()
     needs_slope: bool = False
+    squares: Callable[[ScanPoints, Parameters], FloatArray] | None = None
 
 
 def source_of(
@@ -58,6 +60,7 @@ def source_of(
         if key not in parameters and key not in kind.optional:
             unit = kind.parameters[key].unit
             raise ConfigurationError(f"{name} needs {key} [{unit or '1'}]; state it beside value")
+    squares = kind.squares
     return SystematicSource(
         name=name,
         unit=kind.quantity.unit or "1",
@@ -66,6 +69,7 @@ def source_of(
         origin=origin,
         reason=reason,
         needs_slope=kind.needs_slope,
+        squares=None if squares is None else lambda points: squares(points, parameters),
     )
 
 
@@ -73,9 +77,8 @@ def source_of(
 
 
 def _tilt(p: ScanPoints, _: Parameters) -> FloatArray:
-    """About y and about x: the height changes, and the point goes sideways by its height."""
-    zero, up = np.zeros(len(p)), p.height - np.mean(p.height)
-    return np.stack([p.sideways(up, zero) - p.x, p.y + p.sideways(zero, -up)])
+    """About y and about x; that a tilted point also goes sideways is a hundredth of it."""
+    return np.stack([-p.x, p.y])
 
 
 def _decentre(p: ScanPoints, _: Parameters) -> FloatArray:
@@ -227,6 +230,25 @@ def _drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
     return components(fading(parameters["correlation_time"]), p.time)
 
 
+# ----------------------------------------------- sums of squares of an unknown curve's fields
+
+
+def _of_a_walk(p: ScanPoints, _: Parameters) -> FloatArray:
+    return p.time
+
+
+def _of_a_curve(p: ScanPoints, _: Parameters) -> FloatArray:
+    return np.ones(len(p))
+
+
+def _of_a_curve_sideways(p: ScanPoints, _: Parameters) -> FloatArray:
+    return np.asarray(_across(p, np.ones(len(p)), np.zeros(len(p))) ** 2, np.float64)
+
+
+def _of_pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    return np.full(len(p), parameters["arm"] ** 2)
+
+
 _METRES, _RADIANS = quantities.UNCERTAINTY, quantities.ANGLE_UNCERTAINTY
 _SHARE, _SECONDS = quantities.GAIN_UNCERTAINTY, quantities.TIME_UNCERTAINTY
 _PER_TURN = {"per_turn": quantities.PER_TURN}
@@ -241,7 +263,7 @@ KINDS: dict[str, SourceKind] = {
     ),
     "lateral_lag": SourceKind("latency that X and C do not share", _SECONDS, _lateral_lag),
     "motion_error": SourceKind("half the backlash of Z", _METRES, _backlash),
-    "tilt": SourceKind("tilt of the part, each way", _RADIANS, _tilt, needs_slope=True),
+    "tilt": SourceKind("tilt of the part, each way", _RADIANS, _tilt),
     "decentre": SourceKind("shift of the part, each way", _METRES, _decentre, needs_slope=True),
     "clocking": SourceKind("turn of the part", _RADIANS, _clocking, needs_slope=True),
     "expansion": SourceKind("thermal strain of the part", _SHARE, _expansion, needs_slope=True),
@@ -258,6 +280,7 @@ KINDS: dict[str, SourceKind] = {
         _straightness_x,
         _CORRELATED,
         _LENGTH_OPTIONAL,
+        squares=_of_a_curve,
     ),
     "straightness_z": SourceKind(
         "straightness of Z, sideways",
@@ -266,6 +289,7 @@ KINDS: dict[str, SourceKind] = {
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,
+        squares=_of_a_curve_sideways,
     ),
     "pitch": SourceKind(
         "pitch of Z, over the Abbe arm",
@@ -273,6 +297,7 @@ KINDS: dict[str, SourceKind] = {
         _pitch,
         {"arm": quantities.LENGTH, **_CORRELATED},
         _LENGTH_OPTIONAL,
+        squares=_of_pitch,
     ),
     "spindle_axial": SourceKind(
         "axial motion in step with the spindle", _METRES, _spindle_axial, _PER_TURN
@@ -311,9 +336,15 @@ KINDS: dict[str, SourceKind] = {
         needs_slope=True,
     ),
     "drift_rate": SourceKind("steady drift", quantities.RATE_UNCERTAINTY, _drift_rate),
-    "drift_walk": SourceKind("drift as a random walk", quantities.WALK_UNCERTAINTY, _drift_walk),
+    "drift_walk": SourceKind(
+        "drift as a random walk", quantities.WALK_UNCERTAINTY, _drift_walk, squares=_of_a_walk
+    ),
     "drift": SourceKind(
-        "drift that fades", _METRES, _drift, {"correlation_time": quantities.CORRELATION_TIME}
+        "drift that fades",
+        _METRES,
+        _drift,
+        {"correlation_time": quantities.CORRELATION_TIME},
+        squares=_of_a_curve,
     ),
 }
 """Kinds of systematic error by their names."""

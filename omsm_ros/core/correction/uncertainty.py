@@ -110,19 +110,19 @@ def contributions(
     static_gain: float,
     distance: FloatArray,
     dynamics: FloatArray,
-    timing: FloatArray,
+    z_rate: FloatArray,
     abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
     """Variances of the heights [m²] by their source, each (n,) or the same for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
-    dynamics, timing: variance of H(z) from the covariance and from the sideways lag, (n,)
+    dynamics: variance of H(z) from the covariance [m²], (n,);  z_rate: of H(z) [m/s], (n,)
     abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
     return {
         "dynamics": dynamics,
-        "lateral_lag": timing,
+        "lateral_lag": (sources.lateral_lag * z_rate) ** 2,
         "static_gain": (scale * distance) ** 2,
         "probe_noise": (sources.probe_noise / static_gain) ** 2,
         "probe_resolution": (sources.probe_resolution / static_gain) ** 2 / 12,

@@ -12,6 +12,7 @@ from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.errors import CalibrationError
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
 
+_OPEN = "not evaluated"
 _FIGURE_NAMES = {
     "peak_to_valley": "peak to valley",
     "rms": "rms, every point alike",
@@ -54,12 +55,33 @@ def error_table(summary: Mapping[str, object]) -> Table:
 
 
 def budget_table(summary: Mapping[str, object]) -> Table:
-    """What the uncertainty of a height is made of, the largest part first."""
-    budget: Mapping[str, Any] = part(summary, "uncertainty_budget") or {}
-    known = {name: value for name, value in budget.items() if value}
-    ordered = sorted(known, key=lambda name: -known[name])
-    rows = [(name.replace("_", " "), quantity(known[name], "m")) for name in ordered]
-    return Table("Uncertainty of a height, k = 1, rms over the scan", (), rows)
+    """Every source of uncertainty, the largest first, and last those that nobody looked at."""
+    rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
+    ordered = sorted(rows, key=lambda row: (row["status"] == _OPEN, -(row["height"] or 0.0)))
+    return Table(
+        "Uncertainty of the heights, k = 1, rms over the scan",
+        ("of the source", "of the heights", "acts", "known by"),
+        [_budget_row(row) for row in ordered],
+    )
+
+
+def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    size, unit = row["standard_uncertainty"], row["unit"]
+    known = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
+    return (
+        f"{row['source'].replace('_', ' ')} ({row['says']})",
+        _sized(size, unit),
+        quantity(row["height"], "m"),
+        "on each point" if row["kind"] == "random" else "on all together",
+        known,
+    )
+
+
+def _sized(size: object, unit: str) -> str:
+    """A size in its unit; a share or a rate per radian has no prefix."""
+    if unit == "1":
+        return plain(size) if size is not None else NOTHING
+    return quantity(size, unit)
 
 
 def motion_table(summary: Mapping[str, object]) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,13 +39,28 @@ def verdict_on_measurement(
         against += ["the calibration was rejected", *map(str, certificate.get("reasons") or ())]
     if against:
         return Verdict("bad", "Not to be trusted", tuple(against))
-    doubts = [*map(str, part(summary, "warnings") or ()), *_losses(summary), *_latency(calibration)]
+    warnings = [*map(str, part(summary, "warnings") or ())]
+    if light := part(summary, "light"):
+        return _of_light(light, warnings)
+    doubts = [*warnings, *_losses(summary), *_latency(calibration)]
     if not stated:
         missing = "the calibration has no certificate" if calibration else "no calibration is given"
         return Verdict("unknown", "Not judged", (missing, *doubts))
     if doubts:
         return Verdict("care", "Trusted with reservations", tuple(doubts))
     return Verdict("good", "Trusted", (f"calibration {stated}", "every sample accounted for"))
+
+
+def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> Verdict:
+    """The light of the measurement, amber at best where there are warnings."""
+    level = {"green": "good", "amber": "care", "red": "bad"}[light["level"]]
+    if warnings and level == "good":
+        level = "care"
+    word = light["word"][:1].upper() + light["word"][1:]
+    reasons = [
+        f"{r['what']}: {r['remedy']}" if r["remedy"] else r["what"] for r in light["reasons"]
+    ]
+    return Verdict(level, word, (*warnings, *reasons) or ("every source was looked at",))
 
 
 def _streams(summary: Mapping[str, object]) -> Mapping[str, Any]:

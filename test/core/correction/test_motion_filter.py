@@ -28,7 +28,7 @@ CALIBRATION = Calibration(
     valid_up_to=100.0,
     covariance=np.zeros((7, 7)),
 )
-X, Y, B, C, MOVED, ERROR, DYNAMICS, TIMING = range(8)
+X, Y, B, C, ERROR, MOVED, RATE, SENSITIVITIES = range(8)
 SPEED = np.array([2e-3, -1e-3, 3e-3, 0.01, 3.0])
 
 
@@ -65,10 +65,10 @@ def test_axes_pass_unless_the_lag_is_latency() -> None:
     assert np.allclose(late.values[[X, Y, B, C]], delayed, rtol=0, atol=1e-12)
 
 
-def test_timing_is_the_speed_times_the_uncertainty_of_the_lag() -> None:
-    (run,) = new(lateral_lag_uncertainty=2e-6).push(uniform(0, 100))
-    assert np.allclose(np.sqrt(run.values[TIMING]), 2e-6 * SPEED[2], rtol=1e-6)
-    assert not run.values[DYNAMICS].any()
+def test_the_rate_is_the_speed() -> None:
+    (run,) = new().push(uniform(0, 100))
+    assert np.allclose(run.values[RATE], SPEED[2], rtol=1e-6)
+    assert len(run.values) == SENSITIVITIES
 
 
 def test_too_few_samples_wait_and_are_settling_at_the_end() -> None:
@@ -122,7 +122,8 @@ def test_variance_of_the_dynamics_is_that_of_the_lag_at_constant_speed() -> None
     uncertain = replace(CALIBRATION, covariance=covariance)
     (run,) = MotionFilter(MotionFilters.of(uncertain, 1e-3)).push(uniform(0, 200))
     expected = SPEED[2] ** 2 * ((2e-6) ** 2 + (3e-6) ** 2)
-    np.testing.assert_allclose(run.values[DYNAMICS], expected, rtol=1e-5)
+    found = np.sum(run.values[SENSITIVITIES:] ** 2, axis=0)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_a_run_just_long_enough_to_start_on_is_filtered() -> None:

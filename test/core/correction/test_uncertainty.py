@@ -213,6 +213,7 @@ def test_contributions_by_hand() -> None:
         static_gain=0.1,
         discretisation=5.0,
         pitch=2e-6,
+        lateral_lag=1e-3,
     )
     found = contributions(
         sources,
@@ -232,7 +233,7 @@ def test_contributions_by_hand() -> None:
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
     assert found["pitch"] == pytest.approx((200e-9) ** 2)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
-    assert found["lateral_lag"] == pytest.approx([9.0, 10.0])
+    assert found["lateral_lag"] == pytest.approx([81e-6, 100e-6])
 
 
 def test_a_sideways_lag_costs_its_uncertainty_times_the_speed() -> None:

@@ -90,11 +90,25 @@ def test_a_mapping_keeps_its_names_and_writes_its_values_as_json():
 
 
 class TestBudgetAndMotion:
-    def test_the_largest_part_comes_first_and_nothing_is_left_out_but_zero(self):
-        budget = {"encoder_noise": 1e-9, "probe_noise": 1e-8, "pitch": 0.0}
-        rows = tables.budget_table({"uncertainty_budget": budget}).rows
-        assert [row[0] for row in rows] == ["probe noise", "encoder noise"]
-        assert rows[0][1] == "10.0 nm"
+    def test_the_largest_part_comes_first_and_what_nobody_looked_at_is_there(self):
+        def row(source, size, height, status="evaluated"):
+            return {
+                "source": source, "says": "of it", "kind": "random", "status": status,
+                "standard_uncertainty": size, "unit": "m", "height": height, "reason": "because",
+            }  # fmt: skip
+
+        sources = [
+            row("tilt_of_it", None, None, "not evaluated"),
+            row("encoder_noise", 2e-9, 1e-9),
+            row("probe_noise", 1e-8, 1e-8),
+        ]
+        rows = tables.budget_table({"budget": {"sources": sources}}).rows
+        names = [row[0].split(" (")[0] for row in rows]
+        assert names == ["probe noise", "encoder noise", "tilt of it"]
+        assert rows[0][2] == "10.0 nm"
+        assert rows[1][1] == "2.00 nm"
+        assert rows[2][1:3] == ("–", "–")
+        assert rows[2][4] == "not evaluated: because"
         assert tables.budget_table({}).rows == []
 
     def test_motion_says_how_much_faster(self):

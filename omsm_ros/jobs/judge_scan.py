@@ -1,0 +1,89 @@
+"""What is the uncertainty of a corrected scan made of, and may it be relied on?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from omsm_ros.core.correction.budget import ScanBudget, scan_budget
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.light import Light, Reason, light_of
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.jobs.correct_bag import Correction
+
+# A map with more holes than this hides something.
+_LEAST_SHARE_CORRECTED = 0.95
+
+
+def with_sources(
+    options: CorrectionOptions,
+    calibration: Calibration,
+    stated: MachineSources,
+    nominal: Surface | None,
+) -> CorrectionOptions:
+    """Return ``options`` with what is ``stated`` of the machine and the slopes of ``nominal``."""
+    known = options.sources or ErrorSources.of(calibration)
+    return replace(
+        options,
+        sources=replace(known, **stated.of_points()),
+        systematic=stated.of_the_scan(),
+        surface=nominal,
+    )
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a scan is judged by.
+
+    options: it was corrected with;  stated: of the machine;  accuracy: asked for, k = 2 [m]
+    """
+
+    options: CorrectionOptions
+    stated: MachineSources = NOTHING_STATED
+    accuracy: float | None = None
+
+    def of(
+        self, done: Correction, calibration: Calibration, discretisation: float
+    ) -> dict[str, Any]:
+        """Return ``budget`` and ``light`` for ``summary.json``.
+
+        discretisation: rms of the digital filter's error on the scan's path [m]
+        """
+        options = self.options
+        trace = done.trace.points()
+        budget = scan_budget(
+            calibration,
+            options.sources or ErrorSources.of(calibration),
+            {"discretisation": discretisation}
+            | {name: size for name, size in done.budget.items() if size},
+            options.geometry,
+            self.stated,
+            trace.with_slopes(options.surface) if len(trace) else trace,
+            done.trace.seen,
+        )
+        return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
+
+    def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:
+        return light_of(
+            calibration,
+            budget.heights,
+            self.stated,
+            accuracy=self.accuracy,
+            against_nominal=self.options.surface is not None,
+            doubts=tuple(_losses(done)),
+        )
+
+
+def _losses(done: Correction) -> Iterator[Reason]:
+    for name, stream in done.account.items():
+        lost = stream["received"] - stream["corrected"]
+        if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
+            share = 100 * lost / stream["received"]
+            yield Reason(
+                f"{name}: {lost} samples ({share:.1f} %) gave no point",
+                "see the reasons of the account; run slower where the probe lost its target",
+            )
