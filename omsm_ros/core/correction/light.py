@@ -121,7 +121,7 @@ def light_of(
             f"uncertainty {quantity(uncertainty, 'm')} (k = 2) exceeds the accuracy of "
             f"{quantity(asked, 'm')} asked for",
             f"begin with {largest.replace('_', ' ')}, which alone makes "
-            + quantity(2 * heights[largest], 'm'),
+            + quantity(2 * heights[largest], "m"),
         )
         return _light(RED, calibration, asked, uncertainty, [too_large, *open_, *doubts])
     open_ += doubts
