@@ -28,7 +28,6 @@ from omsm_ros.twin.cell import Recording
 
 from .systematic_scan import spiral_points
 
-
 NO_ERRORS = ErrorSources()
 
 
