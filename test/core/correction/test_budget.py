@@ -168,7 +168,8 @@ def test_the_trace_is_the_scan_in_time_and_place(
     assert np.allclose(trace.slide_y, 0, atol=1e-12)
     speed = np.gradient(trace.z, trace.time)
     inner = slice(2, -2)
-    assert np.allclose(trace.z_rate[inner], speed[inner], atol=0.02 * np.max(abs(speed)))
+    # The rate of single samples has the encoder's noise, some micrometres a second.
+    assert np.std((trace.z_rate - speed)[inner]) < 5e-6 < np.std(speed[inner]) / 2
 
 
 def test_a_restarted_counter_goes_on_in_time() -> None:
