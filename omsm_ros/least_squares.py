@@ -26,11 +26,6 @@ def least_squares(
     return np.asarray(np.linalg.lstsq(unit, values, rcond=tolerance)[0] / scale)
 
 
-def unexplained(columns: FloatArray, values: FloatArray) -> FloatArray:
-    """Return what ``columns`` (n, q) cannot explain of ``values`` (n,), shape (n,)."""
-    return np.asarray(values - columns @ least_squares(columns, values))
-
-
 def orthonormal(columns: FloatArray, tolerance: float) -> FloatArray:
     """Return a basis (n, r) of what ``columns`` (n, q) span.
 

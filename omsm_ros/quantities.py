@@ -198,5 +198,4 @@ TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.
 SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")
 HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
-PROBABILITY = Quantity("probability", "", 0.0, 1.0, "give a share between 0 and 1")
 SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")

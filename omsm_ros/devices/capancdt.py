@@ -28,7 +28,6 @@ PROMPTS = (b"OK\r\n", b"$WRONG", b"$UNKNOWN")
 # A channel's 24 bits are its measuring range.
 FULL_SCALE = 0xFFFFFF
 _COUNTER_RANGE = 2**32
-CONTINUOUS = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,9 +19,6 @@ QUERY = "?"
 MAX_ANSWER_BYTES = 65_536
 MAX_COMMAND_BYTES = 1024
 
-# By baud index 0 to 8 [bit/s].
-BAUD_RATES = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 1_843_200)
-
 _NAME = re.compile(r"[A-Z]{3,}")
 _COMMAND = re.compile(rb"\$([A-Z]{3,})([^A-Z].*)?", re.DOTALL)
 _READY = re.compile(rb"ready(?:\r\n|\r(?!\n)(?=.)|\n)", re.DOTALL)

@@ -139,16 +139,3 @@ def audit(
         for name, order, digital in filters
     ]
     return tuple(sorted(judged, key=lambda a: a.rms))
-
-
-def choose_order(
-    dynamics: TransferFunction,
-    sample_period: float,
-    z: FloatArray,
-    up_to: float,
-    encoder_noise: float = 0.0,
-) -> Audit:
-    """The polynomial with the least error and filtered ``encoder_noise`` [m] together."""
-    judged = audit(dynamics, sample_period, z, up_to)
-    polynomials = [a for a in judged if a.order is not None]
-    return min(polynomials, key=lambda a: np.hypot(a.rms, a.noise_gain * encoder_noise))

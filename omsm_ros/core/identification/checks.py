@@ -41,7 +41,7 @@ def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Findi
         reasons.append(
             f"where the axis moves the residual is only {plain(chi_square, 2)} times the noise "
             f"of {quantity(noise, 'm')} squared: the probe is not quiet where the axis "
-            "rests, or the stated noise is too large; start the recording after a second of rest"
+            "rests; start the recording after a second of rest"
         )
     limits = {"chi_square_least": _LEAST_CHI_SQUARE, "chi_square_greatest": _WORST_CHI_SQUARE}
     return Finding({"chi_square": chi_square, "noise_m": noise}, limits, tuple(reasons))

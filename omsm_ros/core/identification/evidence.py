@@ -22,7 +22,6 @@ class Evidence:
 
     limits: of the 95 % band, within which the response is trusted
     searched: departures from a steady linear response that were looked for
-    noise: known standard deviation of one reading of the probe [m], or None
     """
 
     record: MotionRecord
@@ -31,7 +30,6 @@ class Evidence:
     known: ResponseUncertainty
     limits: ResponseLimits
     searched: Searched
-    noise: float | None = None
 
     @property
     def fit(self) -> Fit:
@@ -46,4 +44,4 @@ class Evidence:
     @cached_property
     def residual(self) -> ResidualTests:
         """Tests of the residual."""
-        return residual_tests(self.prepared.problem, self.fit, self.prepared.steps, self.noise)
+        return residual_tests(self.prepared.problem, self.fit, self.prepared.steps)

@@ -83,17 +83,12 @@ def identify(
     order: int = 0,
     input: str = "encoder",
     settings: Mapping[str, object] | None = None,
-    noise: float | None = None,
-    limits: ResponseLimits = DEFAULT_LIMITS,
 ) -> Identification:
     """Return the calibration that ``record`` supports, with the fit behind it.
 
     order: number of poles, 0 to choose it. Uncertainties of an order that is asked for are
         never smaller than those of the free choice.
     input: "encoder", or "reference" to take the second sensor as the motion
-    noise: known standard deviation of one reading of the probe [m], for χ²; None to take
-        it where the axis rests
-    limits: of the 95 % band, deciding ``valid_up_to``
     settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the masses
         and springs of a response that is that of two masses are in SI, else per table mass
 
@@ -101,7 +96,7 @@ def identify(
     did not see it, ConfigurationError for an input or a mass that cannot be. A model that can
     be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
-    mass = table_mass(settings or {})
+    mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
     searched = search(
         prepare(record, input),
         lambda prepared: model_from_start(prepared, order),
@@ -114,7 +109,7 @@ def identify(
     known = response_uncertainty(prepared, model, limits, hidden)
     if model.free is not None:
         known = no_surer(known, prepared, model, model.free, limits)
-    evidence = Evidence(record, prepared, model, known, limits, searched, noise)
+    evidence = Evidence(record, prepared, model, known, limits, searched)
     findings = _findings(evidence)
     best = model.chosen.fit
     calibration = Calibration(

@@ -39,16 +39,13 @@ class ResidualTests:
     independence: float
 
 
-def residual_tests(
-    problem: Problem, fitted: Fit, steps: Steps, noise: float | None
-) -> ResidualTests:
-    """Tests of the residual of ``fitted``; ``noise`` [m] if known, else taken at rest."""
+def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests:
+    """Compare the residual of ``fitted`` with the noise at rest, with itself, with the motion."""
     on_grid = np.zeros(len(problem.used))
     on_grid[problem.used] = fitted.residual
     active = problem.used & _active(steps, problem.period)
     rest = problem.used & ~active
-    if noise is None:
-        noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
+    noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2

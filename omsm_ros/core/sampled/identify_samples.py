@@ -19,7 +19,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held_equivalent
-from omsm_ros.core.dynamics.response_band import Band, ResponseLimits, widening
+from omsm_ros.core.dynamics.response_band import Band, widening
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import parameter_covariance
 from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
@@ -76,7 +76,6 @@ def identify_samples(
     order: int = 0,
     max_delay: int = 3,
     used: BoolArray | None = None,
-    limits: ResponseLimits = SAMPLED_LIMITS,
 ) -> SampledModel:
     """Return the model by which ``output`` (n,) follows ``input`` (n,), sampled evenly.
 
@@ -85,7 +84,6 @@ def identify_samples(
     order: number of poles, 0 to choose it
     max_delay: of a held input, whole samples to try; of a band-limited one the delay is free
     used: True where the output counts, None where it is finite
-    limits: of the 95 % band, deciding between which frequencies the model is valid
 
     Raises IdentificationError for a useless record, ConfigurationError for another hold.
     """
@@ -93,11 +91,11 @@ def identify_samples(
         raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
     used = np.isfinite(output) if used is None else used & np.isfinite(output)
     if hold == BAND_LIMITED:
-        return band_limited(input, output, used, period, order, limits)
+        return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
     choice = choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
     known = _Known.of(choice.chosen, choice.delay, period)
-    known, factor = _no_surer(known, choice, period, limits)
-    low, high = longest_range(known.band, limits)
+    known, factor = _no_surer(known, choice, period)
+    low, high = longest_range(known.band, SAMPLED_LIMITS)
     return SampledModel(
         hold=hold,
         sample_period=period,
@@ -112,15 +110,13 @@ def identify_samples(
             free_order=choice.free.order,
             widened=factor,
             valid=(low, high),
-            limits=limits,
+            limits=SAMPLED_LIMITS,
             entries=_entries(choice, output[used]),
         ),
     )
 
 
-def _no_surer(
-    known: _Known, choice: SampledChoice, period: float, limits: ResponseLimits
-) -> tuple[_Known, float]:
+def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Known, float]:
     """``known`` with uncertainties that hold those of the free choice, and their factor."""
     if choice.chosen.order == choice.free.order:
         return known, 1.0
@@ -128,7 +124,7 @@ def _no_surer(
     ratio = free.discrete.response(known.frequency, period) / known.discrete.response(
         known.frequency, period
     )
-    low, high = longest_range(known.band, limits)
+    low, high = longest_range(known.band, SAMPLED_LIMITS)
     trusted = (known.frequency >= low) & (known.frequency <= high)
     cut = [
         Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted])

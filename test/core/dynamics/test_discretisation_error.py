@@ -10,7 +10,6 @@ from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import (
     audit,
     checked_motion,
-    choose_order,
     discretisation_error,
     fast_length,
     velocity_spectrum,
@@ -97,14 +96,6 @@ def test_a_delay_cannot_be_transformed_bilinearly() -> None:
     late = TransferFunction(PAPER.numerator, PAPER.denominator, 0.3e-3)
     judged = audit(late, 1e-3, spiral_motion(), up_to=100.0)
     assert all(a.order is not None for a in judged)
-
-
-def test_noise_pays_for_a_low_order_and_fast_motion_for_a_high_one() -> None:
-    fast = 1e-3 * np.sin(2 * np.pi * 40.0 * TIME)
-    quiet = choose_order(PAPER, 1e-3, fast, up_to=100.0)
-    noisy = choose_order(PAPER, 1e-3, 1e-6 * fast, up_to=100.0, encoder_noise=10e-9)
-    assert quiet.order == 7
-    assert noisy.order == 1
 
 
 @pytest.mark.parametrize(
