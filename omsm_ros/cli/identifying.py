@@ -14,10 +14,17 @@ from omsm_ros.core.sampled.identify_samples import HOLDS
 from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.identify_bag import motion_of_bag
-from omsm_ros.jobs.identify_table import model_of_motion, model_of_table
-from omsm_ros.readable import percent, plain, quantity
+from omsm_ros.jobs.identify_table import (
+    SampledRecord,
+    model_of,
+    record_of_motion,
+    record_of_table,
+    run_of,
+    save_run,
+)
+from omsm_ros.readable import count, percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.model_file import save_model
+from omsm_ros.storage.model_file import load_model, save_model
 
 TABLE_SUFFIX = ".csv"
 
@@ -60,7 +67,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
     sub.add_argument(
-        "--report", type=Path, metavar="DIR", help="write the certificate: HTML, Markdown, plots"
+        "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
     )
 
 
@@ -68,7 +75,10 @@ def _identify(args: argparse.Namespace) -> Facts:
     of_table = args.recording.suffix.lower() == TABLE_SUFFIX
     _check_arguments(args, of_table)
     if of_table:
-        return _model_facts(_of_table(args), args.out)
+        record = record_of_table(
+            args.recording, args.input, args.output, args.period, args.duration
+        )
+        return _model_facts(record, args)
     with progress_bar("reading", args.json) as progress:
         motion = motion_of_bag(
             args.recording,
@@ -77,8 +87,7 @@ def _identify(args: argparse.Namespace) -> Facts:
             progress=progress,
         )
     if args.hold != BAND_LIMITED:
-        model = model_of_motion(motion, hold=args.hold, order=args.order, max_delay=args.max_delay)
-        return _model_facts(model, args.out)
+        return _model_facts(record_of_motion(motion), args)
     identified = identify(motion, order=args.order, input=args.input, settings=args.settings)
     facts = calibration_facts(identified.calibration)
     path = kept_at(args.out, facts["verdict"])
@@ -106,36 +115,30 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
             f"--output and --period are for a table; {str(args.recording)!r} is no {TABLE_SUFFIX} "
             "file, and a bag knows both"
         )
-    if args.report is not None and (of_table or args.hold != BAND_LIMITED):
-        raise ConfigurationError(
-            "--report draws the certificate of a calibration; a model of a table, or of a held "
-            "input, has its certificate in its file"
-        )
 
 
-def _of_table(args: argparse.Namespace) -> SampledModel:
-    return model_of_table(
-        args.recording,
-        args.input,
-        args.output,
-        args.period,
-        hold=args.hold,
-        order=args.order,
-        max_delay=args.max_delay,
-        duration=args.duration,
-    )
-
-
-def _model_facts(model: SampledModel, out: Path) -> Facts:
-    path = kept_at(out, str(model.certificate["verdict"]))
+def _model_facts(record: SampledRecord, args: argparse.Namespace) -> Facts:
+    model = model_of(record, hold=args.hold, order=args.order, max_delay=args.max_delay)
+    path = kept_at(args.out, str(model.certificate["verdict"]))
     save_model(path, model)
-    return {
+    facts = {
         **model.certificate,
         "hold": model.hold,
         "valid_from": model.valid_from,
         "valid_up_to": model.valid_up_to,
         "model": str(path),
     }
+    if args.report is not None:
+        facts["report"] = _drawn(args.report, model, record, args.recording)
+    return facts
+
+
+def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) -> str:
+    # Drawing takes a second to import; most commands do without.
+    from omsm_ros.jobs.certify import write_model_page
+
+    run = run_of(model, record)
+    return str(write_model_page(out, model, record, run, source=source.name))
 
 
 def calibration_facts(calibration: Calibration) -> Facts:
@@ -179,6 +182,55 @@ def _show(facts: Facts) -> None:
     table(rows)
 
 
+# ------------------------------------------------------------------------------ validate
+
+
+def _declare_validate(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("model", type=Path, metavar="MODEL.json")
+    sub.add_argument(
+        "record", type=Path, metavar="RECORD.csv", help="another one, sampled as the model is"
+    )
+    sub.add_argument("--input", required=True, help="name of a column")
+    sub.add_argument("--output", required=True, help="name of a column")
+    sub.add_argument("--out", type=Path, metavar="RUN.csv", help="write what the model makes of it")
+    sub.add_argument("--report", type=Path, metavar="DIR", help="write a page")
+
+
+def _validate(args: argparse.Namespace) -> Facts:
+    model = load_model(args.model)
+    record = record_of_table(args.record, args.input, args.output, model.sample_period)
+    run = run_of(model, record)
+    facts: Facts = {
+        "model_verdict": str(model.certificate.get("verdict", "")),
+        "explained": run.explained,
+        "residual_rms": run.rms,
+        "samples": len(record.input),
+    }
+    if args.out is not None:
+        save_run(args.out, record, run)
+        facts["run"] = str(args.out)
+    if args.report is not None:
+        facts["report"] = _drawn(args.report, model, record, args.record)
+    return facts
+
+
+def _show_validate(facts: Facts) -> None:
+    rows = [
+        ("model", facts["model_verdict"] or "not judged"),
+        ("free run accounts for", f"{percent(facts['explained'], 4)} of the output"),
+        ("residual, rms", f"{plain(facts['residual_rms'], 4)} in the units of the output"),
+        ("samples", count(facts["samples"])),
+    ]
+    table([*rows, *((name, facts[name]) for name in ("run", "report") if name in facts)])
+
+
 COMMANDS = (
     Command("identify", "identify G_m from a recording", _declare, _identify, _show, rejected),
+    Command(
+        "validate",
+        "run a model over another record: how much of it does it account for?",
+        _declare_validate,
+        _validate,
+        _show_validate,
+    ),
 )

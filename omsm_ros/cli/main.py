@@ -26,7 +26,7 @@ WORDS = {
     "omsm_ros.cli.measuring": ("inspect", "predict", "correct"),
     "omsm_ros.cli.resolving": ("selfcal", "reversal", "latency"),
     "omsm_ros.cli.aligning": ("align",),
-    "omsm_ros.cli.identifying": ("identify",),
+    "omsm_ros.cli.identifying": ("identify", "validate"),
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
     "omsm_ros.cli.starting": ("doctor",),
     "omsm_ros.cli.importing": ("import",),

@@ -1,4 +1,4 @@
-"""The certificate of a calibration as files to keep: a page, its Markdown, and the plots."""
+"""The certificate of a calibration, or the page of a model, as files to keep."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from pathlib import Path
 from omsm_ros import __version__
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
+from omsm_ros.core.sampled.free_run import FreeRun
+from omsm_ros.core.sampled.model import SampledModel
+from omsm_ros.jobs.identify_table import SampledRecord
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
+from omsm_ros.report.certificate.model_page import ModelPage, model_figures_of, render_model
 from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
 from omsm_ros.storage.files import save_bytes
 from omsm_ros.storage.result_folder import result_folder
 
-PAGE, MARKDOWN = "certificate.html", "certificate.md"
+PAGE, MARKDOWN, MODEL_PAGE = "certificate.html", "certificate.md", "model.html"
 
 
 def write_certificate(out: Path, identified: Identification, *, source: str = "") -> Path:
@@ -24,7 +28,7 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     calibration = identified.calibration
     certificate = CertificatePage(
         calibration,
-        datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        _today(),
         source,
         __version__,
         certificate_figures_of(calibration, fitted_record(identified)),
@@ -36,3 +40,27 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
         for name, content in files.items():
             save_bytes(folder / name, content)
     return out / PAGE
+
+
+def write_model_page(
+    out: Path, model: SampledModel, record: SampledRecord, run: FreeRun, *, source: str = ""
+) -> Path:
+    """Write model.html into ``out``: the model, and its ``run`` over ``record``; return its path.
+
+    source: name of the record, for a reader
+    """
+    page = ModelPage(
+        model,
+        run,
+        _today(),
+        source,
+        __version__,
+        model_figures_of(model, record.input, record.output, run),
+    )
+    with result_folder(out, (MODEL_PAGE,)) as folder:
+        save_bytes(folder / MODEL_PAGE, render_model(page).encode("utf-8", "replace"))
+    return out / MODEL_PAGE
+
+
+def _today() -> str:
+    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")

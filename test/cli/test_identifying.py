@@ -66,6 +66,28 @@ def test_an_order_and_people(capsys, table, tmp_path):
         assert text in said.out
 
 
+def test_a_model_is_drawn_and_runs_over_another_record(capsys, table, tmp_path):
+    model, page = tmp_path / "model.json", tmp_path / "page"
+    arguments = ("--hold", "zero-order", "--out", model, "--report", page, "--json")
+    _, said = run(capsys, table, *COLUMNS, *arguments)
+    assert json.loads(said.out)["report"] == str(page / "model.html")
+    assert (page / "model.html").read_text().count("<figure>") == 3
+    rng = np.random.default_rng(7)
+    u = np.repeat(rng.choice([0.0, 2.0], 100), 6)
+    y = signal.lfilter(B, A, u) + rng.normal(0, 0.01, 600)
+    other, out = tmp_path / "other.csv", tmp_path / "run.csv"
+    np.savetxt(other, np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+    words = ("validate", model, other, "--input", "u", "--output", "y", "--out", out)
+    assert cli.main([str(w) for w in (*words, "--json")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["residual_rms"] == pytest.approx(0.01, rel=0.1)
+    written = np.loadtxt(out, delimiter=",", skiprows=1)
+    assert np.std(written[:, 2] - written[:, 3]) == pytest.approx(facts["residual_rms"], rel=1e-3)
+    assert written[1, 0] == pytest.approx(0.1)
+    assert cli.main([str(w) for w in words]) == 0
+    assert "free run accounts for" in capsys.readouterr().out
+
+
 def test_the_default_hold_of_a_table_is_band_limited(capsys, table, tmp_path):
     out = tmp_path / "model.json"
     run(capsys, table, *COLUMNS, "--out", out, "--json")
@@ -103,7 +125,6 @@ def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test,
         (("--input", "valve", "--output", "flow"), "--period"),
         (("--input", "valve", "--period", 0.1), "--output"),
         (("--input", "valve", "--output", "leak", "--period", 0.1), "'leak'"),
-        ((*COLUMNS, "--report", "out"), "--report"),
         ((*COLUMNS, "--hold", "third-order"), "hold"),
         ((*COLUMNS, "--period", 0), "sample period"),
     ],

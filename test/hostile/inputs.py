@@ -73,6 +73,18 @@ def calibration_texts(draw: st.DrawFn, content: dict[str, Any]) -> bytes:
     return draw(damaged(text)) if draw(st.integers(0, 4)) == 0 else text
 
 
+@st.composite
+def model_texts(draw: st.DrawFn, content: dict[str, Any]) -> bytes:
+    """``MODEL.json`` with a few fields changed, its parts' too, or damaged as a text."""
+    changed: dict[str, Any] = json.loads(json.dumps(content))
+    for _ in range(draw(st.integers(0, 3))):
+        part = draw(st.sampled_from([changed, changed.get("discrete"), changed.get("continuous")]))
+        if isinstance(part, dict) and part:
+            _change(draw, part)
+    text = json.dumps(changed).encode("utf-8", "surrogatepass")
+    return draw(damaged(text)) if draw(st.integers(0, 4)) == 0 else text
+
+
 def _change(draw: st.DrawFn, content: dict[str, Any]) -> None:
     name = draw(st.sampled_from(sorted(content)))
     value = content[name]
@@ -159,14 +171,15 @@ _FLAGS = {
     "plan": ["--out", "--sample-period", "--step", "--count", "--dwell", "--rise", "--half-range"],
     "verify": ["--calibration"],
     "compare": [],
+    "validate": ["--input", "--output", "--out"],
     "selfcal": [
         "--calibration", "--out", "--harmonics", "--clocking", "--polarity", "--static-gain",
         "--gain-uncertainty", "--settings",
     ],
     "latency": ["--delay", "--uncertainty", "--reason", "--out"],
 }  # fmt: skip
-_POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2, "selfcal": 2}
-_FIRST = {"plan": "steps", "compare": "cal.json", "latency": "cal.json"}
+_POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2, "selfcal": 2, "validate": 2}
+_FIRST = {"plan": "steps", "compare": "cal.json", "latency": "cal.json", "validate": "model.json"}
 _SWITCHES = {"--by-stamps", "--override"}
 _GOOD = {
     "--calibration": "cal.json",

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
 
 from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held_equivalent
 from omsm_ros.core.dynamics.response_band import Band, widening
@@ -26,6 +25,7 @@ from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoic
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.sampled.band_limited import band_limited
+from omsm_ros.core.sampled.free_run import resting_output
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
 from omsm_ros.core.sampled.verdict import (
     SAMPLED_LIMITS,
@@ -34,7 +34,6 @@ from omsm_ros.core.sampled.verdict import (
 )
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.least_squares import least_squares
 
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
 _FREQUENCIES = 400
@@ -104,7 +103,7 @@ def identify_samples(
         covariance=None,
         valid_from=low,
         valid_up_to=high,
-        working_point=(float(np.mean(input)), _resting(known.discrete, input, output, used)),
+        working_point=(float(np.mean(input)), resting_output(known.discrete, input, output, used)),
         certificate=sampled_certificate(
             order=choice.chosen.order,
             free_order=choice.free.order,
@@ -134,18 +133,6 @@ def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Kno
         factor = widening(cut[0], cut[1], np.log(ratio[trusted]))
     wider = replace(known.discrete, covariance=factor**2 * known.discrete.covariance)
     return replace(known, discrete=wider, band=wider.band(known.frequency, period)), factor
-
-
-def _resting(discrete: Discrete, input: FloatArray, output: FloatArray, used: BoolArray) -> float:
-    """Output at which the model rests where the input has its mean, initial state fitted."""
-    order, samples = len(discrete.denominator) - 1, len(input)
-    late = np.roll(input, discrete.delay) - np.mean(input)
-    late[: discrete.delay] = 0.0
-    driven = signal.lfilter(discrete.numerator, discrete.denominator, late)
-    pulses = np.eye(max(order + discrete.delay, 1), samples)
-    decays = signal.lfilter([1.0], discrete.denominator, pulses, axis=1)
-    columns = np.column_stack([decays.T, np.ones(samples)])
-    return float(least_squares(columns[used], (output - driven)[used])[-1])
 
 
 def _continuous(discrete: Discrete, period: float, hold: str) -> TransferFunction | None:

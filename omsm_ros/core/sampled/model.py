@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from omsm_ros.core.dynamics.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
 from omsm_ros.core.dynamics.response_band import Band
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import CalibrationError, OmsmError
+from omsm_ros.quantities import FREQUENCY, MAX_DELAY_SAMPLES, SAMPLE_PERIOD, SIGNAL
 
 SCHEMA = "omsm-model/1"
 BAND_LIMITED = "band-limited"
+_ENDS = ("from", "up_to")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,6 +101,35 @@ class SampledModel:
             "certificate": dict(self.certificate),
         }
 
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
+        """The inverse of :meth:`content`, for values of the right types.
+
+        Raises CalibrationError for a model that cannot be, or that cannot be computed with.
+        """
+        period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
+        continuous, covariance = _continuous_of(content["continuous"], period)
+        discrete = None if content["discrete"] is None else _discrete_of(content["discrete"])
+        lacks = covariance if content["hold"] == BAND_LIMITED else discrete
+        if lacks is None:
+            raise CalibrationError(
+                f"model with hold {content['hold']!r}: a held input needs a discrete model, "
+                "a band-limited one a continuous one with its covariance; identify it again"
+            )
+        valid = [FREQUENCY.checked(content[f"valid_{end}"], CalibrationError) for end in _ENDS]
+        point = [SIGNAL.checked(value, CalibrationError) for value in content["working_point"]]
+        return cls(
+            hold=content["hold"],
+            sample_period=period,
+            discrete=discrete,
+            continuous=continuous,
+            covariance=covariance,
+            valid_from=valid[0],
+            valid_up_to=valid[1],
+            working_point=(point[0], point[1]),
+            certificate=content["certificate"],
+        )
+
     def _continuous_content(self) -> dict[str, object]:
         assert self.continuous is not None
         return {
@@ -104,6 +138,63 @@ class SampledModel:
             "delay": self.continuous.delay,
             "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
         }
+
+
+def _continuous_of(
+    content: Mapping[str, Any] | None, period: float
+) -> tuple[TransferFunction | None, FloatArray | None]:
+    if content is None:
+        return None, None
+    if content["delay"] > LONGEST_DELAY_SAMPLES * period:
+        raise CalibrationError(
+            f"delay is {content['delay']!r} s, expected at most {LONGEST_DELAY_SAMPLES} samples "
+            f"of {period!r} s; identify it again"
+        )
+    try:
+        dynamics = TransferFunction(
+            np.asarray(content["numerator"], np.float64),
+            np.asarray(content["denominator"], np.float64),
+            content["delay"],
+        )
+    except OmsmError as err:
+        raise CalibrationError(str(err)) from err
+    if content["covariance"] is None:
+        return dynamics, None
+    size = len(dynamics.numerator) + len(dynamics.denominator)
+    return dynamics, _square(content["covariance"], size)
+
+
+def _discrete_of(content: Mapping[str, Any]) -> Discrete:
+    numerator, denominator = (
+        SIGNAL.checked_all(np.asarray(content[name], np.float64), CalibrationError, name)
+        for name in ("numerator", "denominator")
+    )
+    if denominator[0] != 1 or np.any(abs(np.roots(denominator)) >= 1):
+        raise CalibrationError(
+            f"denominator {denominator.tolist()!r} in z⁻¹ is no stable one that begins with 1; "
+            "identify it again"
+        )
+    return Discrete(
+        numerator=numerator,
+        denominator=denominator,
+        delay=MAX_DELAY_SAMPLES.checked(content["delay_samples"], CalibrationError),
+        covariance=_square(content["covariance"], len(numerator) + len(denominator) - 1),
+    )
+
+
+def _square(values: Sequence[float], size: int) -> FloatArray:
+    """A covariance from its rows one behind the other."""
+    if len(values) != size**2:
+        raise CalibrationError(
+            f"covariance has {len(values)!r} numbers, expected {size**2}; identify it again"
+        )
+    covariance = SIGNAL.checked_all(np.asarray(values, np.float64), CalibrationError)
+    square = np.reshape(covariance, (size, size))
+    if np.any(np.diag(square) < 0) or not np.allclose(square, square.T, rtol=1e-6):
+        raise CalibrationError(
+            "covariance is not symmetric, or has a negative variance; identify it again"
+        )
+    return square
 
 
 def _discrete_content(discrete: Discrete) -> dict[str, object]:

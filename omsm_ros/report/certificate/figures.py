@@ -102,7 +102,7 @@ def residual(fitted: FittedRecord, noise: float | None) -> Figure:
     _draw_over_time(axes[0, 0], fitted, noise)
     if at_edges is not None:
         _draw_at_edges(axes[1, 0], at_edges, noise)
-    _draw_correlation(axes[-1, 0], fitted.residual)
+    draw_correlation(axes[-1, 0], fitted.residual)
     return made
 
 
@@ -135,7 +135,8 @@ def _draw_at_edges(axes: Axes, mean: EdgeMean, noise: float | None) -> None:
     )  # fmt: skip
 
 
-def _draw_correlation(axes: Axes, left: FloatArray) -> None:
+def draw_correlation(axes: Axes, left: FloatArray) -> None:
+    """Correlation of ``left`` (n,) with itself, NaN left out, and the bound of white noise."""
     lags = np.arange(1, _LAGS + 1)
     bound = COVERAGE_FACTOR / np.sqrt(max(int(np.sum(np.isfinite(left))), 1))
     axes.axhspan(-bound, bound, label="95 % if white", **_SPAN)

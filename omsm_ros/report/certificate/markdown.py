@@ -12,6 +12,7 @@ from omsm_ros.report.certificate.page import (
     CertificatePage,
     Section,
     headlines,
+    issued,
     sections,
     verdict_on_calibration,
 )
@@ -41,8 +42,7 @@ def _lines(certificate: CertificatePage) -> Iterator[str]:
     verdict = verdict_on_calibration(certificate.calibration)
     yield "# Calibration certificate"
     yield ""
-    issued = [certificate.source, f"issued {certificate.date}", certificate.calibration.id[:16]]
-    yield text(" · ".join(part for part in issued if part))
+    yield text(issued(certificate))
     yield ""
     yield f"**{text(verdict.word)}**"
     yield ""

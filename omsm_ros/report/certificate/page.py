@@ -37,6 +37,10 @@ CAPTIONS = {
     ),
     "order": ("Each candidate is a structure that was fitted to the same samples."),
 }
+_CLOSING = (
+    "On a fixed target the probe reads offset + drift − static gain · G_m z, with G_m(0) = 1 and z "
+    "from the encoder. After ± stands the standard uncertainty, k = 1; bands are 95 %."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +109,10 @@ def render(certificate: CertificatePage) -> str:
     """The page as HTML; all text from outside is escaped."""
     return fill(
         "certificate.html",
-        certificate=certificate,
+        heading="Calibration certificate",
+        issued=issued(certificate),
+        closing=f"{_CLOSING} Calibration {certificate.calibration.id}.",
+        figures=certificate.figures,
         verdict=verdict_on_calibration(certificate.calibration),
         headlines=headlines(certificate.calibration),
         sections=sections(certificate),
@@ -113,6 +120,12 @@ def render(certificate: CertificatePage) -> str:
         picture=lambda name: picture(certificate.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
+
+
+def issued(certificate: CertificatePage) -> str:
+    """Return recording, date and identity on one line."""
+    identity = certificate.calibration.id[:16]
+    return " · ".join(p for p in (certificate.source, f"issued {certificate.date}", identity) if p)
 
 
 def verdict_on_calibration(calibration: Calibration) -> Verdict:

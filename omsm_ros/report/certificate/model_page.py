@@ -1,0 +1,188 @@
+"""The page of a model between any two sampled quantities, beside a record that it runs over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.dynamics.calibration import REJECTED
+from omsm_ros.core.sampled.free_run import FreeRun
+from omsm_ros.core.sampled.model import SCHEMA, SampledModel
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
+from omsm_ros.report.certificate import model_figures as drawn
+from omsm_ros.report.certificate.page import Section
+from omsm_ros.report.certificate.tables import known_rows, texts
+from omsm_ros.report.common import style
+from omsm_ros.report.common.tables import Table, mapping_table, part
+from omsm_ros.report.common.template import fill, picture
+from omsm_ros.report.common.verdict import Verdict
+from omsm_ros.report.measurement.page import Headline
+
+BAND, RECORD, CORRELATION = "band", "record", "correlation"
+CAPTIONS = {
+    BAND: "Gain and phase with their 95 % band. Grey: not known within the limits.",
+    RECORD: (
+        "The record, and what the model makes of its input alone; the state that it starts in "
+        "is fitted."
+    ),
+    CORRELATION: "From sample to sample: outside the shade the residual is not white.",
+}
+# Coefficients are far more correlated than uncertain: to be of use they need their digits.
+_ALL_DIGITS = 10
+_NOTE = (
+    "The model is of deviations from the working point. Uncertainties are standard, k = 1; those "
+    "of the coefficients are strongly correlated, and the file has their covariance."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ModelPage:
+    """The model, a free run over a record, and what a reader is to be told of both.
+
+    date: of issue;  source: the record;  version: of the software
+    figures: PNG files by the names in :data:`CAPTIONS`
+    """
+
+    model: SampledModel
+    run: FreeRun
+    date: str
+    source: str = ""
+    version: str = ""
+    figures: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def model_figures_of(
+    model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun
+) -> dict[str, bytes]:
+    """PNG files for the page."""
+    made = {
+        BAND: drawn.response(model),
+        RECORD: drawn.record(model, input, output, run),
+        CORRELATION: drawn.correlation(run),
+    }
+    return {name: style.png(figure) for name, figure in made.items()}
+
+
+def render_model(page: ModelPage) -> str:
+    """The page as HTML; all text from outside is escaped."""
+    return fill(
+        "certificate.html",
+        heading="Model",
+        issued=" · ".join(text for text in (page.source, f"issued {page.date}") if text),
+        closing=_NOTE,
+        figures=page.figures,
+        verdict=verdict_on_model(page.model),
+        headlines=_headlines(page),
+        sections=_sections(page),
+        band=BAND,
+        picture=lambda name: picture(page.figures[name]),
+        caption=CAPTIONS.__getitem__,
+    )
+
+
+def verdict_on_model(model: SampledModel) -> Verdict:
+    """The model's own verdict, and why."""
+    stated = str(model.certificate.get("verdict", ""))
+    reasons, warnings = (texts(model.certificate, name) for name in ("reasons", "warnings"))
+    if stated == REJECTED:
+        return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
+    if not stated:
+        return Verdict("unknown", "Not judged", ("the model has no certificate",))
+    return Verdict("care" if warnings else "good", stated[:1].upper() + stated[1:], tuple(warnings))
+
+
+def _headlines(page: ModelPage) -> list[Headline]:
+    model, certificate = page.model, page.model.certificate
+    return [
+        Headline("Free run accounts for", percent(page.run.explained, 4), "of this record"),
+        Headline("Residual, rms", plain(page.run.rms, 4), "in the units of the output"),
+        Headline(
+            "Hidden parts accounted for",
+            percent(certificate.get("predicted"), 4),
+            "when the model was identified",
+        ),
+        Headline(
+            "Valid",
+            f"{quantity(model.valid_from, 'Hz')} to {quantity(model.valid_up_to, 'Hz')}",
+            f"half the sampling rate is {quantity(0.5 / model.sample_period, 'Hz')}",
+        ),
+        Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.hold}"),
+    ]
+
+
+def _sections(page: ModelPage) -> list[Section]:
+    certificate = page.model.certificate
+    tests = [
+        ("whiteness, p", probability(certificate.get("whiteness_p"))),
+        ("independence of the input, p", probability(certificate.get("independence_p"))),
+        ("residual when identified, rms", plain(certificate.get("residual_rms"))),
+        ("poles of the free choice", str(certificate.get("free_order", NOTHING))),
+        ("samples received", count(part(certificate, "samples", "received"))),
+        ("samples compared", count(part(certificate, "samples", "compared"))),
+    ]
+    every = [
+        Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
+        Section("Coefficients", (), tuple(_coefficient_tables(page.model))),
+        Section("Records", (), (_identity(page), _limits(certificate))),
+    ]
+    return [
+        Section(
+            section.title,
+            tuple(name for name in section.figures if name in page.figures),
+            tuple(table for table in section.tables if table.rows),
+        )
+        for section in every
+    ]
+
+
+def _coefficient_tables(model: SampledModel) -> list[Table]:
+    found = []
+    if model.discrete is not None:
+        discrete = model.discrete
+        names = [f"b{k}" for k in range(len(discrete.numerator))]
+        names += [f"a{k}" for k in range(1, len(discrete.denominator))]
+        values = np.concatenate([discrete.numerator, discrete.denominator[1:]])
+        title = f"H(z), ascending powers of z⁻¹, delay of {discrete.delay} samples"
+        found.append(_coefficients(title, names, values, discrete.covariance))
+    if model.continuous is not None:
+        dynamics = model.continuous
+        names = [f"n{k}" for k in range(len(dynamics.numerator))]
+        names += [f"d{k}" for k in range(1, len(dynamics.denominator))] + ["delay [s]"]
+        values = np.concatenate([dynamics.numerator, dynamics.denominator[1:], [dynamics.delay]])
+        found.append(_coefficients("G(s), ascending powers of s", names, values, model.covariance))
+    return found
+
+
+def _coefficients(
+    title: str, names: list[str], values: FloatArray, covariance: FloatArray | None
+) -> Table:
+    spread = [NOTHING] * len(names)
+    if covariance is not None:
+        spread = [plain(float(u), 2) for u in np.sqrt(np.diag(covariance))]
+    rows = [
+        (name, plain(float(value), _ALL_DIGITS), u)
+        for name, value, u in zip(names, values, spread, strict=True)
+    ]
+    return Table(title, ("value", "standard uncertainty"), rows)
+
+
+def _identity(page: ModelPage) -> Table:
+    model = page.model
+    rows = [
+        ("schema", SCHEMA),
+        ("record", page.source or NOTHING),
+        ("sample period", quantity(model.sample_period, "s", 4)),
+        ("working point, input", plain(model.working_point[0], 6)),
+        ("working point, output", plain(model.working_point[1], 6)),
+        ("omsm_ros", page.version or NOTHING),
+    ]
+    return Table("Identity", (), known_rows(rows, 1))
+
+
+def _limits(certificate: Mapping[str, Any]) -> Table:
+    limits = part(certificate, "limits")
+    return mapping_table("Limits of the verdict", limits if isinstance(limits, Mapping) else {})

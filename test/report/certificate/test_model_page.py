@@ -1,0 +1,102 @@
+"""The page of a model says what the model is, and how it runs over this record."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.sampled.free_run import free_run
+from omsm_ros.core.sampled.model import Discrete, SampledModel
+from omsm_ros.report.certificate.model_figures import response, response_of
+from omsm_ros.report.certificate.model_page import (
+    ModelPage,
+    model_figures_of,
+    render_model,
+    verdict_on_model,
+)
+
+HELD = SampledModel(
+    hold="zero-order",
+    sample_period=0.1,
+    discrete=Discrete(
+        numerator=np.array([0.0, 0.4]),
+        denominator=np.array([1.0, -0.6]),
+        delay=1,
+        covariance=np.diag([1e-8, 4e-6, 1e-6]),
+    ),
+    continuous=TransferFunction.from_ascending([1.0], [1.0, 0.2]),
+    covariance=None,
+    valid_from=0.01,
+    valid_up_to=4.0,
+    working_point=(4.0, 30.0),
+    certificate={
+        "verdict": "accepted from 0.01 Hz to 4 Hz",
+        "order": 1,
+        "predicted": 0.91,
+        "warnings": [],
+        "reasons": [],
+        "limits": {"gain": 0.1},
+        "samples": {"received": 400, "compared": 390},
+    },
+)
+SMOOTH = replace(HELD, hold="band-limited", discrete=None, covariance=1e-6 * np.eye(3))
+
+
+@pytest.fixture(scope="module")
+def record():
+    rng = np.random.default_rng(1)
+    return 4.0 + rng.normal(size=400), 30.0 + rng.normal(size=400)
+
+
+def page_of(model, record, **parts):
+    run = free_run(model, *record)
+    return ModelPage(model, run, "today", figures=model_figures_of(model, *record, run), **parts)
+
+
+@pytest.mark.parametrize("model", [HELD, SMOOTH])
+def test_all_parts_are_there(model, record):
+    page = render_model(page_of(model, record, source="<b>.csv", version="1.2"))
+    for text in (
+        "Accepted from",
+        "91.00",
+        "Coefficients",
+        "Working point".lower(),
+        "&lt;b&gt;.csv",
+    ):
+        assert text in page, text
+    assert "<b>.csv" not in page
+    assert page.count("<figure>") == 3
+    assert ("H(z)" in page) is (model is HELD)
+
+
+def test_a_coefficient_stands_beside_its_uncertainty(record):
+    page = render_model(page_of(HELD, record))
+    row = page[page.index(">b1<") :]
+    assert row.index("0.4000000000") < row.index("0.0020") < row.index(">a1<")
+
+
+def test_the_verdict_is_the_models():
+    assert verdict_on_model(HELD).level == "good"
+    warned = replace(HELD, certificate=HELD.certificate | {"warnings": ["w"]})
+    assert verdict_on_model(warned).level == "care"
+    rejected = replace(HELD, certificate={"verdict": "rejected", "reasons": ["too short"]})
+    assert verdict_on_model(rejected).reasons == ("too short",)
+    assert verdict_on_model(replace(HELD, certificate={})).level == "unknown"
+
+
+def test_the_curve_is_the_models_response_and_the_rest_of_the_axis_is_grey():
+    made = response(HELD)
+    gain, phase = made.get_axes()
+    line = next(line for line in gain.get_lines() if len(line.get_xdata()) > 2)
+    frequency = np.asarray(line.get_xdata())
+    value, _ = response_of(HELD, frequency)
+    assert line.get_ydata() == pytest.approx(np.abs(value))
+    # A first-order lag of one sample behind a hold: at 1 Hz its phase is that of H(z) itself.
+    q = np.exp(-2j * np.pi * 0.1)
+    expected = np.degrees(np.angle(0.4 * q**2 / (1 - 0.6 * q)))
+    assert np.interp(1.0, frequency, phase.get_lines()[0].get_ydata()) == pytest.approx(
+        expected, abs=0.1
+    )
+    greys = [patch.get_extents() for patch in phase.patches]
+    assert len(greys) == 2
