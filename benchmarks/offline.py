@@ -20,6 +20,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -34,7 +35,7 @@ def _write_bag(path: Path, samples: int, block: int = _BLOCK) -> None:
     random = np.random.default_rng(0)
     noise = random.normal(0.0, 1e-8, block)
     zero = np.zeros(block)
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in range(0, samples, block):
             n = min(block, samples - first)
             angle = np.pi * 1e-3 * np.arange(first, first + n)

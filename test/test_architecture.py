@@ -55,6 +55,7 @@ ONLY_IN = {
     "serial": {"devices.transport"},
     "socket": {"devices.transport", "emulators.tcp_server"},
     "rosbags": {"storage"},
+    "mcap": {"storage.recording"},
     "matplotlib": {"report"},
     "h5py": {"storage"},
     "x3pio": {"storage.maps"},

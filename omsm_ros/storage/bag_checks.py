@@ -10,8 +10,10 @@ from binascii import crc32
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from os import SEEK_END
 from pathlib import Path
-from struct import pack, unpack
+from struct import unpack_from
+from typing import IO
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
@@ -25,9 +27,12 @@ from omsm_ros.storage.files import open_regular, said
 # rosbag2 writes chunks of less than a megabyte, Foxglove of four.
 MAX_CHUNK_BYTES = 128 * 1024**2
 MAX_MESSAGE_BYTES = 128 * 1024**2
+# The footer with its places and checksum, and the magic bytes (mcap.dev/spec, "Footer (op=0x02)").
+_RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
 _MAX_METADATA_BYTES = 4 * 1024**2
-_MCAP_MAGIC_BYTES, _RECORD_HEAD_BYTES = 8, 9
-_CHUNK, _CRC_AT, _COMPRESSION_AT = 6, 24, 28
+
+
+DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or record it again"
 
 
 @contextmanager
@@ -71,6 +76,26 @@ def check_index(path: Path, reader: Reader) -> None:
             )
 
 
+def check_checksums(path: Path) -> None:
+    """Raise BagError if the index of an MCAP file does not fit its checksum, where it has one."""
+    for part in path.glob("*.mcap") if path.is_dir() else [path]:
+        if part.suffix == ".mcap":
+            with open_regular(part, BagError, "bag") as stream:
+                _check_checksum(part, stream)
+
+
+def _check_checksum(path: Path, stream: IO[bytes]) -> None:
+    end_at = stream.seek(-_END_BYTES, SEEK_END)
+    end = stream.read(_END_BYTES)
+    start, _, checksum = unpack_from("<QQI", end, _RECORD_HEAD_BYTES)
+    if not start or not checksum:
+        return
+    stream.seek(start)
+    index = stream.read(max(end_at - start, 0))
+    if crc32(index + end[:_CHECKED_END_BYTES]) != checksum:
+        raise BagError(f"bag {str(path)!r} has an index that does not fit its checksum: {DAMAGED}")
+
+
 def check_definition(path: Path, connection: Connection, ours: Typestore) -> None:
     """Raise BagError if the bag's definition of a message is not the one that we read it by."""
     expected = ours.hash_rihs01(connection.msgtype)
@@ -104,6 +129,11 @@ def unpacked_message(data: bytes) -> bytes:
     return _zstd(data, MAX_MESSAGE_BYTES, exactly=False)
 
 
+def unpacked_chunk(data: bytes, compression: str, size: int, checksum: int) -> bytes:
+    """Return the records of a chunk; ReaderError if they are not ``size`` bytes, or changed."""
+    return storage_mcap.decompress(data, compression, size, checksum)
+
+
 def _zstd(data: bytes, size: int, exactly: bool = True) -> bytes:
     return _bounded(storage_mcap.zstd.ZstdDecompressor().decompress, data, size, exactly)
 
@@ -123,27 +153,3 @@ def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: 
 
 # rosbags unpacks whatever comes out, and looks at its size afterwards.
 storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
-
-
-# ------------------------------------------------------------------------------ signing
-
-
-def sign_chunks(path: Path) -> None:
-    """Write the checksum of each chunk into an uncompressed MCAP file that has none.
-
-    Readers then see a changed byte; the format is that of mcap.dev/spec, "Chunk (op=0x06)".
-    """
-    with path.open("r+b") as stream:
-        stream.seek(_MCAP_MAGIC_BYTES)
-        while len(head := stream.read(_RECORD_HEAD_BYTES)) == _RECORD_HEAD_BYTES:
-            kind, length = unpack("<BQ", head)
-            start = stream.tell()
-            if kind == _CHUNK:
-                stream.seek(start + _COMPRESSION_AT)
-                named, size = unpack("<IQ", stream.read(12))
-                if named:
-                    raise BagError(f"{str(path)!r} is compressed; sign what is not")
-                checksum = crc32(stream.read(size))
-                stream.seek(start + _CRC_AT)
-                stream.write(pack("<I", checksum))
-            stream.seek(start + length)

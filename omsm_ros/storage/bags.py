@@ -1,17 +1,13 @@
-"""Bags: recordings of the contract's topics, read and written without ROS.
+"""Bags: recordings of the contract's topics, read without ROS.
 
-Reads rosbag2 folders (sqlite3 and MCAP) and bare ``.mcap`` files; writes one bare ``.mcap``
-file, which ``ros2 bag`` and Foxglove open as it is.
+Reads rosbag2 folders (sqlite3 and MCAP) and bare ``.mcap`` files.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -19,38 +15,31 @@ from types import TracebackType
 from typing import Any, TypeAlias
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.storage import conversions
 from omsm_ros.storage.bag_checks import (
+    DAMAGED,
+    check_checksums,
     check_definition,
     check_files,
     check_index,
-    sign_chunks,
     translated,
     unpacked_message,
 )
 from omsm_ros.storage.block_table import long_blocks
-from omsm_ros.storage.files import said
-from omsm_ros.storage.message_types import bag_messages, typestore
-
-AXES_TOPIC = "/omsm/axes"
-DISTANCE_TOPIC = "/omsm/confocal"
-REFERENCE_TOPIC = "/omsm/reference"
-ACCELERATION_TOPIC = "/omsm/acceleration"
-CALIBRATION_TOPIC = "/omsm/calibration"
-POINTS_TOPIC = "/omsm/points"
-
-TOPIC_TYPES = {
-    AXES_TOPIC: "omsm_msgs/msg/AxisBlock",
-    DISTANCE_TOPIC: "omsm_msgs/msg/DistanceBlock",
-    REFERENCE_TOPIC: "omsm_msgs/msg/DistanceBlock",
-    ACCELERATION_TOPIC: "omsm_msgs/msg/AccelerationBlock",
-    CALIBRATION_TOPIC: "omsm_msgs/msg/Calibration",
-    POINTS_TOPIC: "sensor_msgs/msg/PointCloud2",
-}
+from omsm_ros.storage.message_types import typestore
+from omsm_ros.storage.recording.topics import (
+    ACCELERATION_TOPIC,
+    AXES_TOPIC,
+    CALIBRATION_TOPIC,
+    DISTANCE_TOPIC,
+    POINTS_TOPIC,
+    REFERENCE_TOPIC,
+    TOPIC_TYPES,
+)
 
 _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     AXES_TOPIC: conversions.axis_block,
@@ -60,8 +49,6 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     CALIBRATION_TOPIC: conversions.calibration,
     POINTS_TOPIC: conversions.cloud_array,
 }
-
-_DAMAGED = "record it again, or recover what is left of it with the mcap tool"
 
 _BLOCKS: dict[str, type] = {
     AXES_TOPIC: AxisBlock,
@@ -96,16 +83,20 @@ class BagReader:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._stack = ExitStack()
 
     def __enter__(self) -> BagReader:
-        whole = "expected a rosbag2 folder or an .mcap file that was closed properly"
-        with translated(self.path, whole):
+        whole = (
+            "expected a rosbag2 folder or an .mcap file; if its recording was cut short, save what "
+            "is whole with 'omsm inspect --repair'"
+        )
+        with translated(self.path, whole), ExitStack() as opening:
             if not self.path.exists():
                 raise BagError(f"no bag at {str(self.path)!r}; check the path")
             check_files(self.path)
-            self._reader = self._stack.enter_context(Reader(self.path))
+            self._reader = opening.enter_context(Reader(self.path))
             check_index(self.path, self._reader)
+            check_checksums(self.path)
+            self._stack = opening.pop_all()
         self._compressed = self._reader.compression_mode == "message"
         if self._compressed:
             # Unpacked here, to a bound; rosbags would unpack whatever comes.
@@ -174,7 +165,7 @@ class BagReader:
                 yield from ((topic, self._record(topic, raw)) for raw in batch)
 
     def _record(self, topic: str, raw: bytes) -> Any:
-        with translated(self.path, _DAMAGED):
+        with translated(self.path, DAMAGED):
             message = typestore().deserialize_cdr(raw, TOPIC_TYPES[topic])
         with self._malformed_named():
             return _TO_RECORD[topic](message)
@@ -189,7 +180,7 @@ class BagReader:
     def _raw(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, bytes]]:
         """Serialised messages, as many as the bag promises."""
         promised = sum(connection.msgcount for connection in connections)
-        with translated(self.path, _DAMAGED):
+        with translated(self.path, DAMAGED):
             for connection, _, raw in self._reader.messages(connections) if connections else ():
                 promised -= 1
                 yield connection, unpacked_message(raw) if self._compressed else raw
@@ -197,7 +188,7 @@ class BagReader:
             more_or_less = "fewer" if promised > 0 else "more"
             raise BagError(
                 f"bag {str(self.path)!r} holds {abs(promised)} messages {more_or_less} than its "
-                f"index says: it is damaged; {_DAMAGED}"
+                f"index says: {DAMAGED}"
             )
 
     def _connections(self, topic: str) -> list[Connection]:
@@ -214,78 +205,6 @@ class BagReader:
                     f"{topic!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
                     f"{TOPIC_TYPES[topic]!r}; record the topics of the cell"
                 )
-            with translated(self.path, _DAMAGED):
+            with translated(self.path, DAMAGED):
                 check_definition(self.path, connection, typestore())
         return found
-
-
-# ------------------------------------------------------------------------------ writing
-
-
-class BagWriter:
-    """Writes one ``.mcap`` file; it appears under its name only when it is complete.
-
-    Use it as a context manager; leaving it by an exception removes what was written.
-    """
-
-    def __init__(self, path: Path | str, topics: Sequence[str]) -> None:
-        self.path = Path(path)
-        self._topics = topics
-        self._connections: dict[str, Connection] = {}
-
-    def __enter__(self) -> BagWriter:
-        folder = self.path.parent
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._check_name()
-            # In the same folder, so that the last step is a rename and cannot be half done.
-            self._scratch = Path(tempfile.mkdtemp(prefix=".bag-", dir=folder))
-        except (OSError, ValueError) as err:
-            raise BagError(
-                f"cannot write {str(self.path)!r}: {said(err)}; check the folder and its rights"
-            ) from err
-        self._writer = Writer(self._scratch / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
-        for topic in self._topics:
-            self._connections[topic] = self._writer.add_connection(
-                topic, TOPIC_TYPES[topic], typestore=typestore()
-            )
-        return self
-
-    def _check_name(self) -> None:
-        """OSError for a name that no file can have, before an hour is recorded for it."""
-        with suppress(FileNotFoundError):
-            self.path.lstat()
-
-    def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
-        """Append one message as it came over the wire, received at ``stamp_ns``."""
-        self._writer.write(self._connections[topic], stamp_ns, cdr)
-
-    def write(self, topic: str, stamp_ns: int, message: object) -> None:
-        """Append one message made of :func:`bag_messages`."""
-        self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
-
-    def write_axes(self, block: AxisBlock) -> None:
-        """Append a block of the axes at its own stamp."""
-        message = conversions.axis_message(bag_messages(), block)
-        self.write(AXES_TOPIC, block.stamp_ns, message)
-
-    def write_distance(self, block: DistanceBlock) -> None:
-        """Append a block of the probe at its own stamp."""
-        message = conversions.distance_message(bag_messages(), block)
-        self.write(DISTANCE_TOPIC, block.stamp_ns, message)
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            self._writer.close()
-            if kind is None:
-                written = self._scratch / "bag" / "bag.mcap"
-                sign_chunks(written)
-                os.replace(written, self.path)
-        finally:
-            shutil.rmtree(self._scratch, ignore_errors=True)

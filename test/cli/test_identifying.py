@@ -8,6 +8,7 @@ from scipy import signal
 
 from omsm_ros import cli
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 B, A = np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5])
@@ -106,7 +107,7 @@ def test_duration_cuts_the_table(capsys, table, tmp_path):
 
 def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test, tmp_path):
     bag = tmp_path / "steps.mcap"
-    with bags.BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+    with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
             writer.write_axes(axes)
             writer.write_distance(distance)

@@ -7,6 +7,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.storage import bags, calibration_file, cloud_file
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 
@@ -15,7 +16,7 @@ def folder(tmp_path_factory, step_test, small_scan_blocks, true_calibration):
     """Two bags, a calibration and a nominal surface."""
     folder = tmp_path_factory.mktemp("cell")
     for name, blocks in (("steps", blocks_of(step_test)), ("scan", small_scan_blocks)):
-        with bags.BagWriter(folder / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        with BagWriter(folder / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
             for axes, distance in blocks:
                 bag.write_axes(axes)
                 bag.write_distance(distance)
@@ -23,7 +24,7 @@ def folder(tmp_path_factory, step_test, small_scan_blocks, true_calibration):
     (folder / "mirror.yaml").write_text(
         "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
     )
-    with bags.BagWriter(folder / "empty.mcap", (bags.REFERENCE_TOPIC,)):
+    with BagWriter(folder / "empty.mcap", (bags.REFERENCE_TOPIC,)):
         pass
     (folder / "notes.txt").write_text("the mirror looks fine\n")
     return folder
@@ -173,7 +174,7 @@ def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_p
     wobble = 2e-6 * np.sin(0.37 * np.arange(len(step_test.axes)))
     path, good = tmp_path / "steps.mcap", tmp_path / "cal.json"
     good.write_text("precious")
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(step_test):
             at = slice(distance.first_sample, distance.first_sample + len(distance))
             moving = np.abs(np.gradient(axes.z)).max() > 1e-9

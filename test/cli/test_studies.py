@@ -11,6 +11,7 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.trajectories import Chirp, Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.storage import bags, calibration_file, cloud_file, files, machine_files, motion_file
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
@@ -21,7 +22,7 @@ SPHERE_RADIUS_M = 0.05
 
 
 def write(path, recording):
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(recording, 1000):
             bag.write_axes(axes)
             bag.write_distance(distance)
@@ -240,7 +241,7 @@ def test_streams_of_different_rates_are_joined_by_their_stamps(
     fast = record(Cell(sample_period=0.5e-3), spiral_of(Scenario(start_radius=2e-3)), PAPER_MIRROR)
     ahead_ns = 300_000
     path = tmp_path / "two_clocks.mcap"
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, _ in blocks_of(fast, 1000):
             stamp, count = axes.stamp_ns + 10**9 + ahead_ns, axes.first_sample + 77
             bag.write_axes(replace(axes, stamp_ns=stamp, first_sample=count))

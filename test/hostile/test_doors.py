@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.sampled.model import Discrete, SampledModel
-from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.machine_files import save_geometry
 from omsm_ros.storage.model_file import save_model
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 MODEL = SampledModel(
@@ -53,7 +53,7 @@ def place(tmp_path_factory, small_scan_blocks, step_test, true_calibration) -> P
     """A folder with one good file of each kind, and some that are none."""
     folder = tmp_path_factory.mktemp("hostile")
     for name, blocks in (("scan", small_scan_blocks[:BLOCKS]), ("steps", blocks_of(step_test))):
-        with bags.BagWriter(folder / f"{name}.mcap", bag_inputs.TOPICS) as bag:
+        with BagWriter(folder / f"{name}.mcap", bag_inputs.TOPICS) as bag:
             for axes, distance in blocks:
                 bag.write_axes(axes)
                 bag.write_distance(distance)

@@ -14,6 +14,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.jobs.certify import MARKDOWN, PAGE, write_certificate
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 PICTURES = {f"certificate_{name}.png" for name in ("band", "step", "residual", "order")}
@@ -22,7 +23,7 @@ PICTURES = {f"certificate_{name}.png" for name in ("band", "step", "residual", "
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory, step_test):
     path = tmp_path_factory.mktemp("bags") / "steps.mcap"
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
             writer.write_axes(axes)
             writer.write_distance(distance)

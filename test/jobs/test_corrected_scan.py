@@ -16,13 +16,14 @@ from omsm_ros.jobs.correct_bag import correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
 from omsm_ros.storage import bags, conversions, message_types
 from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
 
 def write(path, blocks, ahead=0):
     """A bag whose axes were recorded ``ahead`` blocks before the distance."""
-    with bags.BagWriter(path, TOPICS) as bag:
+    with BagWriter(path, TOPICS) as bag:
         for k in range(len(blocks) + ahead):
             # At the time of its writing, which a reader goes by, not at its own.
             stamp = k * 100_000_000
@@ -94,7 +95,7 @@ def test_axes_that_go_on_without_the_probe_are_no_error(
 ):
     monkeypatch.setattr(corrected_scan, "MOST_WAITING", 5000)
     path = tmp_path / "stopped.mcap"
-    with bags.BagWriter(path, TOPICS) as writer:
+    with BagWriter(path, TOPICS) as writer:
         for k, (axes, distance) in enumerate(small_scan_blocks):
             writer.write_axes(axes)
             if k < 100:
@@ -136,7 +137,7 @@ def test_overridden_it_says_so_in_the_cloud(bag, true_calibration, tmp_path):
 @pytest.mark.parametrize("topics", [(), (bags.AXES_TOPIC,)], ids=["nothing", "no probe"])
 def test_a_bag_without_samples_is_refused(tmp_path, small_scan_blocks, true_calibration, topics):
     path = tmp_path / "empty.mcap"
-    with bags.BagWriter(path, TOPICS) as writer:
+    with BagWriter(path, TOPICS) as writer:
         if topics:
             writer.write_axes(small_scan_blocks[0][0])
     with pytest.raises(BagError, match="no samples on"):

@@ -11,6 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bag_checks, bags, conversions, message_types
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 AXES = bags.TOPIC_TYPES[bags.AXES_TOPIC]
 
@@ -28,7 +29,7 @@ def message(small_scan_blocks):
 @pytest.fixture
 def written(tmp_path, small_scan_blocks):
     path = tmp_path / "scan.mcap"
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in small_scan_blocks[:40]:
             bag.write_axes(axes)
             bag.write_distance(distance)
@@ -94,13 +95,24 @@ def test_all_channels_of_a_topic_are_read(tmp_path, small_scan_blocks):
         assert [(t.topic, t.messages) for t in reader.topics()] == [(bags.AXES_TOPIC, 10)]
 
 
-def test_fewer_messages_than_promised_are_damage(written):
-    whole = bytearray(written.read_bytes())
-    statistics = whole.rindex(struct.pack("<Q", 80))  # messages in all, then by channel
-    place = whole.index(struct.pack("<HQ", 1, 40), statistics)
-    whole[place : place + 10] = struct.pack("<HQ", 1, 41)
-    written.write_bytes(whole)
+def with_another_count(path, channel, count, stated):
+    """Change what the index says of a channel."""
+    whole = bytearray(path.read_bytes())
+    place = whole.rindex(struct.pack("<HQ", channel, count))
+    whole[place : place + 10] = struct.pack("<HQ", channel, stated)
+    path.write_bytes(whole)
+
+
+def test_fewer_messages_than_promised_are_damage(tmp_path, message):
+    path = foreign_bag(tmp_path / "bag", [message] * 99)
+    with_another_count(path, 1, 99, 100)
     with pytest.raises(BagError, match="1 messages fewer than its index says"):
+        records(path)
+
+
+def test_a_changed_index_does_not_fit_its_checksum(written):
+    with_another_count(written, 1, 40, 41)
+    with pytest.raises(BagError, match=r"index that does not fit its checksum.*--repair"):
         records(written)
 
 
@@ -169,7 +181,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
 def test_a_name_longer_than_names_are_is_refused(tmp_path):
     with pytest.raises(BagError, match="name too long"):
         records(tmp_path / ("n" * 300 + ".mcap"))
-    with pytest.raises(BagError, match="cannot write"), bags.BagWriter(tmp_path / ("n" * 300), ()):
+    with pytest.raises(BagError, match="cannot write"), BagWriter(tmp_path / ("n" * 300), ()):
         pass
 
 

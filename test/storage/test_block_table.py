@@ -15,6 +15,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import BagError, DataError
 from omsm_ros.storage import bags, conversions, message_types
 from omsm_ros.storage.block_table import long_blocks
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 RANDOM = np.random.default_rng(7)
 
@@ -132,7 +133,7 @@ def test_a_period_that_is_none_is_refused() -> None:
 def test_a_bag_gives_the_same_samples_either_way(tmp_path) -> None:
     sizes, path = [100] * 30 + [37] + [100] * 5, tmp_path / "a.mcap"
     starts = np.cumsum([0, *sizes])
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first, n in zip(starts.tolist(), sizes, strict=False):
             bag.write_axes(axes(first, n))
             bag.write_distance(replace(distance(first, n), stamp_ns=first * 1_000_000))
@@ -152,7 +153,7 @@ def test_a_block_without_samples_is_a_damaged_bag(tmp_path) -> None:
     message = conversions.axis_message(message_types.bag_messages(), axes(0, 1))
     for name in "xyzbc":
         setattr(message, name, np.empty(0))
-    with bags.BagWriter(path, (bags.AXES_TOPIC,)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
         bag.write(bags.AXES_TOPIC, 0, message)
     with bags.BagReader(path) as bag, pytest.raises(BagError, match="0 samples"):
         list(bag.blocks(bags.AXES_TOPIC))

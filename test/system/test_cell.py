@@ -191,10 +191,11 @@ def test_calibrator_answers_bad_requests_and_stays(cell):
 
 def test_calibrator_identifies_from_a_bag(cell, tmp_path, step_test):
     from omsm_ros.storage import bags
+    from omsm_ros.storage.recording.bag_writer import BagWriter
     from omsm_ros.twin.cell import blocks_of
 
     bag = tmp_path / "steps.mcap"
-    with bags.BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+    with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
             writer.write_axes(axes)
             writer.write_distance(distance)

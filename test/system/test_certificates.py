@@ -9,12 +9,13 @@ pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
 from omsm_msgs.srv import Identify
 
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.scenario import Scenario, step_test_of
 
 
 def _bag(path, rise):
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test_of(Scenario(step_rise=rise))):
             writer.write_axes(axes)
             writer.write_distance(distance)

@@ -14,6 +14,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.nodes.running import LATCHED_QOS
 from omsm_ros.storage import bags, conversions
 from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 pytestmark = pytest.mark.timeout(120)
@@ -182,7 +183,7 @@ def test_predict_error_of_a_sine_is_that_of_its_frequency(cell, true_calibration
 
     bag = tmp_path / "motion.mcap"
     zero = np.zeros(5000)
-    with bags.BagWriter(bag, (bags.AXES_TOPIC,)) as writer:
+    with BagWriter(bag, (bags.AXES_TOPIC,)) as writer:
         for first in range(0, 5000, 500):
             writer.write_axes(
                 AxisBlock(

@@ -1,0 +1,159 @@
+"""What can be saved of a recording that was cut short or damaged?
+
+Every whole chunk whose checksum fits, copied message by message into a new bag with an index.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from struct import unpack
+from typing import IO
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from omsm_ros.errors import BagError
+from omsm_ros.storage.bag_checks import MAX_CHUNK_BYTES, unpacked_chunk
+from omsm_ros.storage.files import open_regular, said
+from omsm_ros.storage.recording.bag_writer import finish, new_bag_file, new_writer
+
+_HEAD_BYTES = 9
+# Besides its samples a chunk record has two times, sizes, a checksum and a name.
+_MOST_BYTES = MAX_CHUNK_BYTES + 1000
+_MOST_NAMED = 20
+
+
+@dataclass
+class Repair:
+    """What was saved, and what was not.
+
+    path: the new bag;  messages: saved, by topic;  lost: what could not be saved, and why
+    """
+
+    path: Path
+    messages: Counter[str] = field(default_factory=Counter)
+    lost: list[str] = field(default_factory=list)
+
+
+def repair(path: Path) -> Repair:
+    """Copy what is whole of an MCAP bag, a file or a folder, to ``<its name>.repaired.mcap``.
+
+    Raises BagError if that exists, or ``path`` is no MCAP bag; ``path`` itself is only read.
+    """
+    parts = sorted(path.glob("*.mcap"), key=_number) if path.is_dir() else [path]
+    if not parts:
+        raise BagError(
+            f"{str(path)!r} holds no .mcap file; only MCAP is repaired here, "
+            "for sqlite3 try 'ros2 bag reindex'"
+        )
+    made = Repair(path.resolve().with_name(f"{path.resolve().stem}.repaired.mcap"))
+    with open_regular(parts[0], BagError, "bag") as stream:
+        _check_magic(stream, parts[0])
+    file = new_bag_file(made.path)
+    try:
+        writer = new_writer(file)
+        for part in parts:
+            _Copy(part, writer, made).run(file.flush)
+        finish(writer, file)
+    except OSError as err:
+        raise BagError(f"cannot write {str(made.path)!r}: {said(err)}; make room") from err
+    finally:
+        file.close()
+    return made
+
+
+def _number(part: Path) -> tuple[int, str]:
+    """Its place among the files of a rosbag2 folder, which end in _0, _1, … _10."""
+    number = part.stem.rpartition("_")[2]
+    return (int(number) if number.isdecimal() else 0, part.name)
+
+
+def _check_magic(stream: IO[bytes], path: Path) -> None:
+    if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise BagError(f"{str(path)!r} is no MCAP file: it begins otherwise; check the path")
+
+
+class _Copy:
+    """Of one file into a bag; its channels and definitions get the numbers of that bag."""
+
+    def __init__(self, path: Path, writer: Writer, made: Repair) -> None:
+        self._path, self._writer, self._made = path, writer, made
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, tuple[int, str]] = {}
+
+    def run(self, written: Callable[[], None]) -> None:
+        with open_regular(self._path, BagError, "bag") as stream:
+            _check_magic(stream, self._path)
+            for place, kind, body in self._records(stream):
+                try:
+                    for record in _within(kind, body):
+                        self._add(record)
+                except Exception as err:  # the libraries raise what their parts raise
+                    self._lose(f"{len(body)} bytes at {place}: {said(err)}")
+                written()
+
+    def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
+        while True:
+            place = stream.tell()
+            head = stream.read(_HEAD_BYTES)
+            kind, length = unpack("<BQ", head) if len(head) == _HEAD_BYTES else (0, 0)
+            if kind == Opcode.DATA_END:
+                return
+            body = stream.read(min(length, _MOST_BYTES))
+            if not kind or len(body) < length:
+                rest = len(head) + len(body)
+                self._lose(f"the last {rest} bytes, at {place}: the file was cut short there")
+                return
+            yield place, kind, body
+
+    def _add(self, record: McapRecord) -> None:
+        if isinstance(record, Schema) and record.id not in self._schemas:
+            self._schemas[record.id] = self._writer.register_schema(
+                record.name, record.encoding, record.data
+            )
+        elif isinstance(record, Channel) and record.id not in self._channels:
+            number = self._writer.register_channel(
+                record.topic,
+                record.message_encoding,
+                self._schemas[record.schema_id],
+                record.metadata,
+            )
+            self._channels[record.id] = number, record.topic
+        elif isinstance(record, Message):
+            if record.channel_id not in self._channels:
+                raise ValueError(f"channel {record.channel_id} was declared in a part that is lost")
+            number, topic = self._channels[record.channel_id]
+            self._writer.add_message(
+                number, record.log_time, record.data, record.publish_time, record.sequence
+            )
+            self._made.messages[topic] += 1
+
+    def _lose(self, what: str) -> None:
+        if len(self._made.lost) < _MOST_NAMED:
+            self._made.lost.append(f"{self._path.name}: {what}")
+
+
+def _within(kind: int, body: bytes) -> list[McapRecord]:
+    """The definitions, channels and messages of a record; an exception if it is damaged."""
+    stream = ReadDataStream(BytesIO(body))
+    if kind == Opcode.SCHEMA:
+        return [Schema.read(stream)]
+    if kind == Opcode.CHANNEL:
+        return [Channel.read(stream)]
+    if kind == Opcode.MESSAGE:
+        return [Message.read(stream, len(body))]
+    if kind != Opcode.CHUNK:
+        return []
+    chunk = Chunk.read(stream)
+    chunk.data = unpacked_chunk(
+        chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
+    )
+    chunk.compression = ""
+    return breakup_chunk(chunk)

@@ -1,0 +1,189 @@
+"""Writes bags: one bare ``.mcap`` file, which ``ros2 bag`` and Foxglove open as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.errors import BagError
+from omsm_ros.storage import conversions
+from omsm_ros.storage.files import said
+from omsm_ros.storage.message_types import bag_messages, typestore
+from omsm_ros.storage.recording.growing_file import GrowingFile
+from omsm_ros.storage.recording.topics import (
+    AXES_TOPIC,
+    DISTANCE_TOPIC,
+    LATCHED_DEPTH,
+    LATCHED_TOPICS,
+    SAMPLES_DEPTH,
+    TOPIC_TYPES,
+)
+
+# What a hard end costs is a chunk at most; smaller ones are slower to read.
+CHUNK_BYTES = 1024 * 1024
+
+# In the form and words of rosbag2 9; the times are its infinity.
+_FOREVER = "{{sec: 9223372036, nsec: 854775807}}"
+_OFFERED_QOS = f"""\
+- history: keep_last
+  depth: {{depth}}
+  reliability: reliable
+  durability: {{durability}}
+  deadline: {_FOREVER}
+  lifespan: {_FOREVER}
+  liveliness: automatic
+  liveliness_lease_duration: {_FOREVER}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+class BagWriter:
+    """Writes one ``.mcap`` file in place: what was flushed can be read, whatever happens then.
+
+    Use it as a context manager; however it is left, the bag is readable.
+
+    path: a file that does not exist yet; BagError if it does, or cannot be made
+    topics: of the contract;  names: what the bag calls them, where not by the contract's name
+    """
+
+    def __init__(
+        self, path: Path | str, topics: Sequence[str], names: Mapping[str, str] | None = None
+    ) -> None:
+        self.path = Path(path)
+        self._names = {topic: (names or {}).get(topic, topic) for topic in topics}
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._taken = self._kept = 0
+        self._failed = False
+
+    def __enter__(self) -> BagWriter:
+        self._file = new_bag_file(self.path)
+        self._writer = new_writer(self._file)
+        for topic, name in self._names.items():
+            self._channels[topic] = self._channel(name, topic)
+        try:
+            with self._room():
+                self._file.flush()
+        except BagError:
+            self.path.unlink()
+            raise
+        return self
+
+    def _channel(self, name: str, topic: str) -> int:
+        kind, latched = TOPIC_TYPES[topic], topic in LATCHED_TOPICS
+        if kind not in self._schemas:
+            text, _ = typestore().generate_msgdef(kind, ros_version=2)
+            self._schemas[kind] = self._writer.register_schema(
+                kind, SchemaEncoding.ROS2, text.encode()
+            )
+        qos = _OFFERED_QOS.format(
+            depth=LATCHED_DEPTH if latched else SAMPLES_DEPTH,
+            durability="transient_local" if latched else "volatile",
+        )
+        metadata = {"offered_qos_profiles": qos, "topic_type_hash": typestore().hash_rihs01(kind)}
+        return self._writer.register_channel(
+            name, MessageEncoding.CDR, self._schemas[kind], metadata
+        )
+
+    # --------------------------------------------------------------------------- messages
+
+    def write_raw(
+        self, topic: str, stamp_ns: int, cdr: bytes | memoryview, published_ns: int | None = None
+    ) -> None:
+        """Append one message as it came over the wire, received at ``stamp_ns``.
+
+        BagError if there is no room for it; what was written before stays readable.
+        """
+        if self._failed:
+            return
+        published = stamp_ns if published_ns is None else published_ns
+        self._writer.add_message(self._channels[topic], stamp_ns, bytes(cdr), published)
+        self._taken += 1
+        if self._file.waiting:  # a chunk is full
+            self.flush()
+
+    def flush(self) -> None:
+        """Put all messages so far on the disk, readable; BagError if there is no room for them."""
+        if self._failed:
+            return
+        with self._room():
+            self._writer.flush()
+        self._kept = self._taken
+
+    @contextmanager
+    def _room(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as err:
+            self._failed = True
+            raise BagError(
+                f"recording ended, {str(self.path)!r} takes no more: {said(err)}; it is readable "
+                f"and holds the first {self._kept} messages, the last {self._taken - self._kept} "
+                "are lost; make room and record anew"
+            ) from err
+
+    def write(self, topic: str, stamp_ns: int, message: object) -> None:
+        """Append one message made of :func:`bag_messages`."""
+        self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
+
+    def write_axes(self, block: AxisBlock) -> None:
+        """Append a block of the axes at its own stamp."""
+        message = conversions.axis_message(bag_messages(), block)
+        self.write(AXES_TOPIC, block.stamp_ns, message)
+
+    def write_distance(self, block: DistanceBlock) -> None:
+        """Append a block of the probe at its own stamp."""
+        message = conversions.distance_message(bag_messages(), block)
+        self.write(DISTANCE_TOPIC, block.stamp_ns, message)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.flush()
+            if not self._failed:
+                with self._room():
+                    finish(self._writer, self._file)
+        finally:
+            with self._room():
+                self._file.close()
+
+
+# ---------------------------------------------------------------------------- the file
+
+
+def new_bag_file(path: Path) -> GrowingFile:
+    """Make a file for a bag; BagError if there is one, or none can be made."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return GrowingFile(path)
+    except FileExistsError as err:
+        raise BagError(
+            f"{str(path)!r} exists and is not overwritten; give another name, or move it away"
+        ) from err
+    except (OSError, ValueError) as err:
+        raise BagError(
+            f"cannot write {str(path)!r}: {said(err)}; check the folder and its rights"
+        ) from err
+
+
+def new_writer(file: GrowingFile) -> Writer:
+    """Begin an MCAP file of ROS 2, with checksums; samples of a probe do not compress."""
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
+    writer.start(Profile.ROS2, "omsm_ros")
+    return writer
+
+
+def finish(writer: Writer, file: GrowingFile) -> None:
+    """Write the index; OSError if there is no room for it, and the bag is readable without."""
+    writer.finish()
+    file.complete()

@@ -1,0 +1,150 @@
+"""What can be saved of a bag that was cut short or damaged."""
+
+import struct
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from omsm_ros.errors import BagError
+from omsm_ros.storage import bags, conversions, message_types
+from omsm_ros.storage.recording.bag_repair import repair
+from omsm_ros.storage.recording.bag_writer import BagWriter
+
+TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
+BLOCKS, CHUNK = 24, 4
+
+
+def first_samples(path, topic=bags.AXES_TOPIC):
+    with bags.BagReader(path) as reader:
+        return [block.first_sample for _, block in reader.records(topic)]
+
+
+@pytest.fixture
+def whole(tmp_path, small_scan_blocks):
+    """A bag of 24 pairs of blocks in chunks of four."""
+    path = tmp_path / "scan.mcap"
+    with BagWriter(path, TOPICS) as bag:
+        for index, (axes, distance) in enumerate(small_scan_blocks[:BLOCKS], start=1):
+            bag.write_axes(axes)
+            bag.write_distance(distance)
+            if index % CHUNK == 0:
+                bag.flush()
+    return path
+
+
+def ends_of_chunks(path):
+    """Where each chunk ends in the file; read off the format (mcap.dev/spec, "Records")."""
+    data, place, ends = path.read_bytes(), 8, []
+    while place < len(data) - 8:
+        kind, length = struct.unpack_from("<BQ", data, place)
+        place += 9 + length
+        if kind == 6:
+            ends.append(place)
+    return ends
+
+
+def test_a_cut_bag_gives_all_but_the_chunk_that_was_cut(whole, small_scan_blocks):
+    data, ends = whole.read_bytes(), ends_of_chunks(whole)
+    expected = [axes.first_sample for axes, _ in small_scan_blocks[:BLOCKS]]
+    assert len(ends) == BLOCKS // CHUNK
+    for length in np.linspace(50, len(data), 40, dtype=int):
+        whole.write_bytes(data[:length])
+        made = repair(whole)
+        chunks = sum(end <= length for end in ends)
+        kept = CHUNK * chunks
+        assert made.messages == (dict.fromkeys(TOPICS, kept) if kept else {})
+        assert bool(made.lost) == (length < len(data) - 400)
+        if kept:
+            assert first_samples(made.path) == expected[:kept]
+            assert first_samples(made.path, bags.DISTANCE_TOPIC) == expected[:kept]
+        assert whole.read_bytes() == data[:length]
+        made.path.unlink()
+
+
+def test_a_damaged_chunk_is_left_out_and_named(whole, small_scan_blocks):
+    data, ends = bytearray(whole.read_bytes()), ends_of_chunks(whole)
+    place = ends[2] - 100  # samples of the third chunk
+    data[place] ^= 1
+    whole.write_bytes(data)
+    made = repair(whole)
+    (lost,) = made.lost
+    assert "checksum" in lost
+    assert "scan.mcap" in lost
+    expected = [axes.first_sample for axes, _ in small_scan_blocks[:BLOCKS]]
+    assert first_samples(made.path) == expected[: 2 * CHUNK] + expected[3 * CHUNK :]
+
+
+def test_the_original_and_an_earlier_repair_are_never_overwritten(whole):
+    before = whole.read_bytes()
+    made = repair(whole)
+    assert made.path.name == "scan.repaired.mcap"
+    kept = made.path.read_bytes()
+    with pytest.raises(BagError, match=r"scan\.repaired\.mcap' exists"):
+        repair(whole)
+    assert (whole.read_bytes(), made.path.read_bytes()) == (before, kept)
+
+
+def test_a_bag_without_index_gets_one(tmp_path, small_scan_blocks):
+    path = tmp_path / "scan.mcap"
+    bag = BagWriter(path, TOPICS).__enter__()
+    for axes, _ in small_scan_blocks[:3]:
+        bag.write_axes(axes)
+    bag.flush()
+    made = repair(path)
+    assert made.lost == []
+    assert first_samples(made.path) == first_samples(path)
+    assert made.path.stat().st_size > path.stat().st_size
+    bag.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_folder_of_rosbag2_without_its_metadata(tmp_path, small_scan_blocks, packed):
+    """As rosbag2 leaves it when it is killed: no metadata.yaml, no end."""
+    store, folder = message_types.typestore(), tmp_path / "night"
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+    if packed:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    kind = bags.TOPIC_TYPES[bags.AXES_TOPIC]
+    with writer:
+        connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)
+        for axes, _ in small_scan_blocks[:5]:
+            message = conversions.axis_message(message_types.bag_messages(), axes)
+            writer.write(connection, axes.stamp_ns, store.serialize_cdr(message, kind))
+    (folder / "metadata.yaml").unlink()
+    part = folder / "night.mcap"
+    part.write_bytes(part.read_bytes()[: ends_of_chunks(part)[-1]])
+    made = repair(folder)
+    assert made.path == tmp_path / "night.repaired.mcap"
+    assert first_samples(made.path) == [axes.first_sample for axes, _ in small_scan_blocks[:5]]
+
+
+def test_what_is_no_mcap_is_refused_and_nothing_is_made(tmp_path):
+    text = tmp_path / "notes.mcap"
+    text.write_text("the mirror looks fine")
+    with pytest.raises(BagError, match="no MCAP file"):
+        repair(text)
+    with pytest.raises(BagError, match="no bag at"):
+        repair(tmp_path / "none.mcap")
+    empty = tmp_path / "folder"
+    empty.mkdir()
+    with pytest.raises(BagError, match="ros2 bag reindex"):
+        repair(empty)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "notes.mcap"]
+
+
+def test_any_damage_is_survived_and_what_is_saved_is_true(whole, small_scan_blocks):
+    data = whole.read_bytes()
+    truth = {axes.first_sample: axes.z for axes, _ in small_scan_blocks[:BLOCKS]}
+    random = np.random.default_rng(8)
+    for _ in range(60):
+        damaged = bytearray(data)
+        for place in random.integers(8, len(data), 3):
+            damaged[place] ^= int(random.integers(1, 256))
+        whole.write_bytes(damaged)
+        made = repair(whole)
+        if made.messages[bags.AXES_TOPIC]:
+            with bags.BagReader(made.path) as reader:
+                for _, block in reader.records(bags.AXES_TOPIC):
+                    np.testing.assert_array_equal(block.z, truth[block.first_sample])
+        made.path.unlink()
