@@ -25,6 +25,7 @@ ROSDEP = {
     # rosdep has no keys for these; the README says how to install them.
     "control": ("control", None),
     "cobs": ("cobs", None),
+    "mcap": ("mcap", None),
 }
 
 # Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.

@@ -23,7 +23,8 @@ _LONGEST_LINE = 1500
 
 # A correction takes a quarter of a second; loading what identifies would take twice that.
 WORDS = {
-    "omsm_ros.cli.measuring": ("inspect", "predict", "correct"),
+    "omsm_ros.cli.inspecting": ("inspect",),
+    "omsm_ros.cli.measuring": ("predict", "correct"),
     "omsm_ros.cli.resolving": ("selfcal", "reversal", "latency"),
     "omsm_ros.cli.aligning": ("align",),
     "omsm_ros.cli.identifying": ("identify", "validate"),

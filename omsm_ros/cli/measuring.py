@@ -1,4 +1,4 @@
-"""Commands around a scan: inspect, predict, correct."""
+"""Commands around a scan: predict, correct."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits, ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
-from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.readable import percent, plain, quantity
@@ -43,28 +42,6 @@ def sources_of(text: str) -> MachineSources:
 def geometry_of(path: Path | None) -> Geometry:
     """Return the probe's place from a file, or none but zeros without one."""
     return load_geometry(path) if path else Geometry()
-
-
-# ------------------------------------------------------------------------------- inspect
-
-
-def _declare_inspect(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path)
-
-
-def _inspect(args: argparse.Namespace) -> Facts:
-    with progress_bar("reading", args.json) as progress:
-        found = inspect_bag(args.bag, progress)
-    return {"bag": str(args.bag), "topics": as_json(found)}
-
-
-def _show_inspect(facts: Facts) -> None:
-    row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
-    names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
-    print(row.format(rate="rate Hz", **{name: name for name in names}))
-    for topic in facts["topics"]:
-        period = topic["sample_period"]
-        print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
 
 
 # ------------------------------------------------------------------------------- correct
@@ -213,7 +190,6 @@ def _limit_text(limit: Mapping[str, Any]) -> str:
 
 
 COMMANDS = (
-    Command("inspect", "show what a bag holds", _declare_inspect, _inspect, _show_inspect),
     Command(
         "predict",
         "what a motion will cost, and how fast it may run",

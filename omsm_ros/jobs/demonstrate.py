@@ -134,9 +134,20 @@ class Demonstration:
         }
 
     def prepare(self) -> None:
-        """Make the folder and clear it of an earlier run's results."""
+        """Make the folder and clear it of an earlier run's results.
+
+        OmsmError if it holds anything, and is not the folder of a demonstration.
+        """
         _ = self.disturbances  # a file that cannot be read is told before anything is cleared
         self.out.mkdir(parents=True, exist_ok=True)
+        mark = self.out / _MARK
+        # A scan and a calibration of a real machine have the same names.
+        if any(self.out.iterdir()) and not mark.is_file():
+            raise OmsmError(
+                f"{str(self.out)!r} holds files that no demonstration made; give a folder that is "
+                "empty or does not exist yet"
+            )
+        mark.write_text("Whatever is in this folder, the next demonstration replaces.\n")
         stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
         for path in stale:
             if path.is_dir():
@@ -147,6 +158,7 @@ class Demonstration:
 
 
 OVERVIEW = "overview.png"
+_MARK = "made_by_omsm_demo.txt"
 _RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
 
 

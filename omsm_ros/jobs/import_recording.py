@@ -25,6 +25,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.foreign_tables import ForeignTable, TextForm
+from omsm_ros.storage.recording.bag_writer import whole_bag
 
 
 @dataclass(slots=True)
@@ -67,7 +68,7 @@ def import_recording(
     topics = [bags.AXES_TOPIC] * any("z" in c for c in chains)
     topics += [bags.DISTANCE_TOPIC] * any("distance" in c for c in chains)
     done = 0
-    with bags.BagWriter(out, topics) as bag:
+    with whole_bag(out, topics) as bag:
         # By time, as they would have been recorded, so that no reader has to keep one back.
         merged = heapq.merge(*map(_continued, chains.values()), key=lambda block: block.stamp_ns)
         for block in merged:

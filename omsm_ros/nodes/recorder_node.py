@@ -108,24 +108,22 @@ class RecorderNode(Node):
     def _take_what_is_on_its_way(self) -> None:
         begin = quiet_since = time.monotonic()
         while time.monotonic() < min(quiet_since + _ON_ITS_WAY_S, begin + _LONGEST_S):
-            if any([self._take_waiting(each) for each in self._subscribed.values()]):
+            if sum(self._take_waiting(each) for each in self._subscribed.values()):
                 quiet_since = time.monotonic()
             time.sleep(_ON_ITS_WAY_S / 20)
 
-    def _take_waiting(self, subscription: Subscription) -> bool:
-        handle, any_taken = subscription.handle, False
+    def _take_waiting(self, subscription: Subscription) -> int:
+        handle, count = subscription.handle, 0
         with handle:
             while (taken := handle.take_message(subscription.msg_type, True)) is not None:
                 subscription.callback(*taken)
-                any_taken = True
-        return any_taken
+                count += 1
+        return count
 
     # --------------------------------------------------------------------- diagnostics
 
     def _report(self) -> tuple[bytes, str, dict[str, object]]:
-        heard = {
-            n: s.get_publisher_count() for n, s in zip(self._counts, self._subscribed.values())
-        }
+        heard = {s.topic_name: s.get_publisher_count() for s in self._subscribed.values()}
         values = {**self._counts, "lost": self._lost}
         values |= {f"publishers_of_{name}": count for name, count in heard.items()}
         if self._failure is not None:

@@ -77,6 +77,25 @@ def test_inspect_counts_what_is_there(capsys, folder):
     assert axes["sample_period"] == 1e-3
 
 
+def test_a_cut_bag_is_repaired_beside_itself(capsys, folder, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    whole = (folder / "scan.mcap").read_bytes()
+    cut.write_bytes(whole[: len(whole) // 2])
+    status, _, err = run(capsys, "inspect", cut)
+    assert status == 2
+    assert "omsm inspect --repair" in err
+    status, text, _ = run(capsys, "inspect", cut, "--repair")
+    assert status == 0
+    assert "messages saved" in text
+    assert "lost" in text
+    assert "cut short" in text
+    status, text, _ = run(capsys, "inspect", tmp_path / "cut.repaired.mcap", "--json")
+    axes, distance = json.loads(text)["topics"]
+    assert axes["samples"] == pytest.approx(20_000, abs=6000)  # but for the last chunk
+    assert abs(axes["samples"] - distance["samples"]) <= 100
+    assert run(capsys, "inspect", cut, "--repair")[0] == 2  # it is there already
+
+
 @pytest.mark.parametrize("command", ["identify", "correct", "inspect"])
 def test_every_command_speaks_to_people_too(capsys, folder, tmp_path, command):
     arguments = {
@@ -192,12 +211,12 @@ def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_p
 
 
 def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypatch, folder):
-    from omsm_ros.cli import measuring
+    from omsm_ros.cli import inspecting
 
     def broken(*_):
         raise AttributeError("'NoneType' object has no\nattribute 'z'")
 
-    monkeypatch.setattr(measuring, "inspect_bag", broken)
+    monkeypatch.setattr(inspecting, "inspect_bag", broken)
     status, out, err = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert (status, out) == (70, "")
     assert err.count("\n") == 1
@@ -209,9 +228,9 @@ def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypat
 
 
 def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
-    from omsm_ros.cli import measuring
+    from omsm_ros.cli import inspecting
 
-    monkeypatch.setattr(measuring, "as_json", lambda _: [{"a": float("nan"), "b": [float("inf")]}])
+    monkeypatch.setattr(inspecting, "as_json", lambda _: [{"a": float("nan"), "b": [float("inf")]}])
     status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0
     assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

@@ -39,6 +39,25 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_cleared(tmp_path)
     assert kept.exists()
 
 
+@pytest.mark.parametrize("name", ["scan.mcap", "calibration.json", "log/driver.log", "notes.txt"])
+def test_a_folder_with_files_of_a_machine_is_refused_and_stays(tmp_path, name):
+    kept = tmp_path / "cell" / name
+    kept.parent.mkdir(parents=True)
+    kept.write_text("precious")
+    with pytest.raises(OmsmError, match="holds files that no demonstration made"):
+        Demonstration(tmp_path / "cell").prepare()
+    assert kept.read_text() == "precious"
+    assert [p for p in (tmp_path / "cell").rglob("*") if p.is_file()] == [kept]
+
+
+def test_the_folder_of_an_earlier_demonstration_is_cleared(tmp_path):
+    plan = Demonstration(tmp_path / "demo")
+    plan.prepare()
+    plan.bag.write_bytes(b"old")
+    plan.prepare()
+    assert not plan.bag.exists()
+
+
 def test_the_truth_holds_the_latency(true_calibration):
     """Against a probe 0.34 ms late, the plant's own dynamics lead by ω · 0.34 ms."""
     step = step_test_of(Demonstration(Path()).scenario, CATALOGUE["latency"][2])

@@ -7,12 +7,13 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.samples.foreign_columns import Column, ColumnMap
-from omsm_ros.errors import FileError, OmsmError
+from omsm_ros.errors import BagError, FileError, OmsmError
 from omsm_ros.jobs.import_recording import import_recording
 from omsm_ros.jobs.read_bag import read_blocks
 from omsm_ros.storage import bags
 from omsm_ros.storage.column_map_file import load_column_map
 from omsm_ros.storage.foreign_tables import TextForm
+from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 MAP = """
@@ -59,6 +60,15 @@ def imported(tmp_path, mapping, *files):
     return found, out
 
 
+def test_a_bag_that_exists_is_refused_and_stays(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((9, 2)))
+    (tmp_path / "out.mcap").write_bytes(b"precious")
+    mapping = "sample_period: 0.001\ncolumns:\n  distance: {name: '[0]', unit: um}\n"
+    with pytest.raises(BagError, match=r"out\.mcap' exists"):
+        imported(tmp_path, mapping, "a.npy")
+    assert (tmp_path / "out.mcap").read_bytes() == b"precious"
+
+
 def samples_of(bag):
     blocks = read_blocks(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC))
     return columns(list(zip(*blocks.values(), strict=True))), blocks
@@ -71,7 +81,7 @@ def test_a_step_test_as_csv_gives_the_calibration_of_its_bag(capsys, tmp_path, s
     assert cli.main([*map(str, arguments), "--out", str(tmp_path / "a.mcap"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["files"][0]["rows"] == len(steps["z"])
-    with bags.BagWriter(tmp_path / "b.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(tmp_path / "b.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(step_test):
             bag.write_axes(axes)
             bag.write_distance(distance)
@@ -271,6 +281,7 @@ def test_matlab_and_numpy_tables_by_index(tmp_path):
         (block,) = read_blocks(out, (bags.DISTANCE_TOPIC,))[bags.DISTANCE_TOPIC]
         assert block.distance == pytest.approx(table[:, 1] * 1e-6)
         assert found.rows == 50
+        out.unlink()
 
 
 def test_hdf5_by_group_and_channel(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.storage import conversions
-from omsm_ros.storage.files import said
+from omsm_ros.storage.files import beside, said
 from omsm_ros.storage.message_types import bag_messages, typestore
 from omsm_ros.storage.recording.growing_file import GrowingFile
 from omsm_ros.storage.recording.topics import (
@@ -158,6 +159,28 @@ class BagWriter:
                 self._file.close()
 
 
+@contextmanager
+def whole_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
+    """Yield the writer of a bag that appears when all went well, and not at all otherwise.
+
+    BagError if there is such a file, or no room for it.
+    """
+    if os.path.lexists(path):
+        raise _exists(path)
+    part = beside(path)
+    try:
+        with BagWriter(part, topics) as bag:
+            yield bag
+        part.rename(path)
+    except (BagError, OSError) as err:
+        cause = err.__cause__ if isinstance(err, BagError) else err
+        if not isinstance(cause, OSError):
+            raise
+        raise _not_writable(path, cause) from err
+    finally:
+        part.unlink(missing_ok=True)
+
+
 # ---------------------------------------------------------------------------- the file
 
 
@@ -167,13 +190,21 @@ def new_bag_file(path: Path) -> GrowingFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         return GrowingFile(path)
     except FileExistsError as err:
-        raise BagError(
-            f"{str(path)!r} exists and is not overwritten; give another name, or move it away"
-        ) from err
+        raise _exists(path) from err
     except (OSError, ValueError) as err:
-        raise BagError(
-            f"cannot write {str(path)!r}: {said(err)}; check the folder and its rights"
-        ) from err
+        raise _not_writable(path, err) from err
+
+
+def _exists(path: Path) -> BagError:
+    return BagError(
+        f"{str(path)!r} exists and is not overwritten; give another name, or move it away"
+    )
+
+
+def _not_writable(path: Path, err: Exception) -> BagError:
+    return BagError(
+        f"cannot write {str(path)!r}: {said(err)}; check the folder, its rights and its room"
+    )
 
 
 def new_writer(file: GrowingFile) -> Writer:

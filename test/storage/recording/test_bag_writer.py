@@ -21,7 +21,7 @@ from omsm_ros.errors import BagError
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording import growing_file
 from omsm_ros.storage.recording.bag_repair import repair
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.storage.recording.bag_writer import BagWriter, whole_bag
 from omsm_ros.storage.recording.topics import LATCHED_TOPICS, TOPIC_TYPES
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
@@ -138,7 +138,7 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
         """
         import sys
         from omsm_ros.core.samples.blocks import AxisBlock
-        from omsm_ros.storage.recording.bag_writer import BagWriter
+        from omsm_ros.storage.recording.bag_writer import BagWriter, whole_bag
         import numpy as np
         zeros = {name: np.zeros(100) for name in "xyzbc"}
         bag = BagWriter(sys.argv[1], ("/omsm/axes",)).__enter__()
@@ -170,6 +170,26 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
             made.path.unlink()
         assert found[:flushed] == [100 * n for n in range(flushed)]
         assert len(found) <= flushed + 1
+
+
+def test_a_whole_bag_appears_when_all_went_well_or_not_at_all(tmp_path, axes):
+    path = tmp_path / "made.mcap"
+
+    def interrupted():
+        with whole_bag(path, TOPICS) as bag:
+            bag.write_axes(axes[0])
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+    with whole_bag(path, TOPICS) as bag:
+        bag.write_axes(axes[0])
+        assert not path.exists()
+    assert first_samples(path) == [axes[0].first_sample]
+    with pytest.raises(BagError, match=r"made\.mcap' exists"):
+        whole_bag(path, TOPICS).__enter__()
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # --------------------------------------------------------------------------- no more room

@@ -1,0 +1,55 @@
+"""The command that looks into a bag, and saves what is whole of a damaged one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
+
+
+def _declare(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path)
+    sub.add_argument(
+        "--repair",
+        action="store_true",
+        help="copy what is whole of an MCAP bag to <bag>.repaired.mcap; the bag stays as it is",
+    )
+
+
+def _act(args: argparse.Namespace) -> Facts:
+    if args.repair:
+        return _repaired(args.bag)
+    with progress_bar("reading", args.json) as progress:
+        found = inspect_bag(args.bag, progress)
+    return {"bag": str(args.bag), "topics": as_json(found)}
+
+
+def _repaired(bag: Path) -> Facts:
+    from omsm_ros.storage.recording.bag_repair import repair  # seldom needed, slow to load
+
+    made = repair(bag)
+    return {
+        "bag": str(bag),
+        "repaired": str(made.path),
+        "messages": dict(made.messages),
+        "lost": made.lost,
+    }
+
+
+def _show(facts: Facts) -> None:
+    if "repaired" in facts:
+        saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
+        lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
+        table([("written", facts["repaired"]), *saved, *lost])
+        return
+    row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
+    names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
+    print(row.format(rate="rate Hz", **{name: name for name in names}))
+    for topic in facts["topics"]:
+        period = topic["sample_period"]
+        print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+
+
+COMMANDS = (Command("inspect", "show what a bag holds, or repair it", _declare, _act, _show),)
