@@ -15,6 +15,7 @@ from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs import run_campaign as campaign
 from omsm_ros.jobs.run_campaign import CRASHED, DONE, REFUSED, load_campaign, run_campaign
 from omsm_ros.storage import bags, calibration_file
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 OPTIONS = ("--no-report",)
 
@@ -25,7 +26,7 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
     folder = tmp_path_factory.mktemp("shop")
     (folder / "bags" / "monday").mkdir(parents=True)
     for name in ("a", "b", "monday/c"):
-        with bags.BagWriter(
+        with BagWriter(
             folder / "bags" / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
         ) as bag:
             for axes, distance in islice(iter(small_scan_blocks), 30):
