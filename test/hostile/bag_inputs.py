@@ -11,7 +11,7 @@ from hostile.inputs import NUMBERS, damaged
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from omsm_ros.storage import bags, conversions
+from omsm_ros.storage import bags, conversions, message_types
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 _COUNTERS = st.one_of(
@@ -30,7 +30,7 @@ _LENGTHS = st.sampled_from([0, 1, 99, 101])
 
 def messages_of(blocks: list[tuple[Any, Any]]) -> list[tuple[str, Any]]:
     """Messages of pairs of blocks, by topic."""
-    classes = bags.bag_messages()
+    classes = message_types.bag_messages()
     return [
         item
         for axes, distance in blocks
@@ -106,7 +106,7 @@ def write_bag(folder: Path, how: tuple[Any, ...]) -> str:
         plugin is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE
     ):
         writer.set_compression(mode, CompressionFormat.ZSTD)
-    store = bags.typestore()
+    store = message_types.typestore()
     with writer:
         connections = {
             topic: writer.add_connection(topic, bags.TOPIC_TYPES[topic], typestore=store)
