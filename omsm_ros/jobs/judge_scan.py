@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.light import Light, Reason, light_of
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
+from omsm_ros.core.correction.scan_fields import resolves_turns, scan_fields
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.jobs.correct_bag import Correction
+from omsm_ros.storage.fields_file import save_fields
+from omsm_ros.storage.files import SYSTEMATIC
 
 # A map with more holes than this hides something.
 _LEAST_SHARE_CORRECTED = 0.95
@@ -40,11 +44,13 @@ class Judgement:
     """What a scan is judged by.
 
     options: it was corrected with;  stated: of the machine;  accuracy: asked for, k = 2 [m]
+    out: folder for the fields of its systematic errors, None to keep none
     """
 
     options: CorrectionOptions
     stated: MachineSources = NOTHING_STATED
     accuracy: float | None = None
+    out: Path | None = None
 
     def of(
         self, done: Correction, calibration: Calibration, discretisation: float
@@ -65,6 +71,8 @@ class Judgement:
             trace.with_slopes(options.surface) if len(trace) else trace,
             done.trace.seen,
         )
+        if self.out is not None and len(trace) and resolves_turns(trace):
+            save_fields(self.out / SYSTEMATIC, scan_fields(budget.fields, done.trace.every))
         return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
 
     def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:

@@ -44,6 +44,8 @@ def measure(
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
 
+    Beside them systematic.npz, what the systematic errors do to the points, for ``omsm form``.
+
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
@@ -63,7 +65,7 @@ def measure(
         by_stamps=by_stamps,
         progress=progress,
     )
-    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy))
+    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out))
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)

@@ -14,6 +14,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.storage import strict_json
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
+SYSTEMATIC = "systematic.npz"
 """The files of a measurement."""
 
 

@@ -73,6 +73,11 @@ class ScanTrace:
         self._keep(points)
         return points
 
+    @property
+    def every(self) -> int:
+        """Of how many points one is kept."""
+        return self._kept.every
+
     def _keep(self, points: ScanPoints) -> None:
         self.seen += len(points)
         rows = [getattr(points, name) for name in _COLUMNS]

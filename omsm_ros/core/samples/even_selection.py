@@ -24,6 +24,11 @@ class EvenSelection:
         """Rows kept."""
         return -(-self._seen // self._every)
 
+    @property
+    def every(self) -> int:
+        """Of how many rows one is kept."""
+        return self._every
+
     def add(self, rows: NDArray[Any]) -> None:
         """Take in the next ``rows`` (n, …)."""
         part = rows[-self._seen % self._every :: self._every]

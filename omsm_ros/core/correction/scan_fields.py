@@ -1,0 +1,86 @@
+"""What do the systematic errors of a scan do to each of its points, however many there are?
+
+Sensitivity fields are had at some points, evenly chosen; between them they are interpolated in the
+order of the scan. Components that hardly count are left out, so that a figure of the heights is
+propagated through a few fields, not through hundreds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.correction.systematic import ScanPoints
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+
+# Of the variance of one source: half a hundredth of its standard uncertainty. Of that of all: a
+# figure may look where the largest ones do nothing, so a five-hundredth of a standard uncertainty.
+_LEFT_OUT_OF_ONE, _LEFT_OUT_OF_ALL = 1e-2, 4e-6
+# With fewer points a turn what repeats twice in it would be cut off between them.
+_LEAST_POINTS_PER_TURN = 12
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFields:
+    """Independent systematic errors of a scan.
+
+    names: of the source of each, (s,);  every: of how many points of the scan one is here
+    fields: change of the heights [m] per standard uncertainty, (s, m)
+    """
+
+    names: tuple[str, ...]
+    fields: FloatArray
+    every: int
+
+    def at(self, first: int, count: int) -> FloatArray:
+        """Return the fields (s, count) [m] at the scan's points from ``first`` on."""
+        if not self.fields.size:
+            return np.zeros((len(self.names), count))
+        last = self.fields.shape[1] - 1
+        place = np.minimum((first + np.arange(count)) / self.every, last)
+        below = np.minimum(place.astype(np.int64), max(last - 1, 0))
+        share = place - below
+        above = np.minimum(below + 1, last)
+        return np.asarray(
+            self.fields[:, below] * (1 - share) + self.fields[:, above] * share, np.float64
+        )
+
+
+def scan_fields(fields: Mapping[str, FloatArray], every: int) -> ScanFields:
+    """Return the components that count of ``fields``, by source (k, m) [m]."""
+    names: list[str] = []
+    rows: list[FloatArray] = []
+    for name, found in fields.items():
+        principal = _principal(found)
+        names += [name] * len(principal)
+        rows += list(principal)
+    if not rows:
+        return ScanFields((), np.empty((0, 0)), every)
+    kept = np.flatnonzero(_count(np.array(rows), _LEFT_OUT_OF_ALL))
+    return ScanFields(tuple(names[k] for k in kept), np.array([rows[k] for k in kept]), every)
+
+
+def resolves_turns(points: ScanPoints) -> bool:
+    """Return whether ``points`` are close enough for what repeats with the spindle's turns."""
+    # An angle that is wrapped jumps by a turn once a turn.
+    steps = np.abs(np.diff(np.unwrap(points.c)))
+    return not len(steps) or float(np.median(steps)) <= 2 * np.pi / _LEAST_POINTS_PER_TURN
+
+
+def _principal(fields: FloatArray) -> FloatArray:
+    """Return uncorrelated rows whose squares add up as those of ``fields``, but for small ones."""
+    moved = fields - np.mean(fields, axis=1, keepdims=True)
+    rows = np.linalg.eigh(moved @ moved.T)[1].T @ fields
+    return np.asarray(rows[_count(rows, _LEFT_OUT_OF_ONE)], np.float64)
+
+
+def _count(rows: FloatArray, left_out: float) -> BoolArray:
+    """Return which ``rows`` (k, n) make up all but the share ``left_out`` of their variance."""
+    own = np.var(rows, axis=1)
+    order = np.argsort(own)
+    small = order[np.cumsum(own[order]) <= left_out * own.sum()]
+    counts = np.ones(len(rows), bool)
+    counts[small] = False
+    return counts

@@ -1,0 +1,50 @@
+"""``systematic.npz``: what the systematic errors of a scan do to its points."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import open_regular, said, save_bytes
+
+# A hundred fields of ten thousand points are four megabytes.
+MAX_BYTES = 100_000_000
+_NAMES = ("names", "fields", "every")
+
+
+def save_fields(path: Path | str, fields: ScanFields) -> None:
+    """Write ``systematic.npz``."""
+    content = io.BytesIO()
+    np.savez(
+        content,
+        names=np.array(fields.names, dtype=np.str_),
+        fields=fields.fields.astype(np.float32),
+        every=np.int64(fields.every),
+    )
+    save_bytes(path, content.getvalue())
+
+
+def load_fields(path: Path | str) -> ScanFields:
+    """Read ``systematic.npz``; FileError if it is something else."""
+    what = f"fields {str(path)!r}"
+    with open_regular(Path(path), FileError, "fields") as stream:
+        raw = stream.read(MAX_BYTES + 1)
+    if len(raw) > MAX_BYTES:
+        raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
+    try:
+        with np.load(io.BytesIO(raw), allow_pickle=False) as content:
+            names, fields, every = (content[name] for name in _NAMES)
+        found = ScanFields(tuple(map(str, names)), fields.astype(np.float64), int(every))
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
+        raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err
+    shape = found.fields.shape
+    if len(shape) != 2 or shape[0] != len(names) or found.every < 1:
+        raise FileError(f"{what} have shape {shape!r} for {len(names)} names; correct it again")
+    if not np.all(np.isfinite(found.fields)):
+        raise FileError(f"{what} hold what is no number; correct the scan again")
+    return found

@@ -1,0 +1,49 @@
+"""``systematic.npz`` there and back, and nothing else is taken for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.errors import FileError
+from omsm_ros.storage.fields_file import load_fields, save_fields
+
+FIELDS = ScanFields(("tilt", "tilt"), np.arange(6.0).reshape(2, 3) * 1e-9, 32)
+
+
+def test_there_and_back(tmp_path):
+    path = tmp_path / "systematic.npz"
+    save_fields(path, FIELDS)
+    found = load_fields(path)
+    assert (found.names, found.every) == (FIELDS.names, 32)
+    assert np.allclose(found.fields, FIELDS.fields, rtol=1e-6, atol=0)
+    none = ScanFields((), np.empty((0, 0)), 1)
+    save_fields(path, none)
+    assert load_fields(path).names == ()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"names": np.array(["tilt"]), "fields": np.zeros((2, 3)), "every": 1},
+        {"names": np.array(["tilt"]), "fields": np.zeros((1, 3)), "every": 0},
+        {"names": np.array(["tilt"]), "fields": np.full((1, 3), np.nan), "every": 1},
+        {"names": np.array(["tilt"]), "fields": np.zeros((1, 3))},
+        {"names": np.array(["tilt"]), "fields": np.array([["a"]]), "every": 1},
+        {"names": np.array([{}], dtype=object), "fields": np.zeros((1, 3)), "every": 1},
+    ],
+)
+def test_what_does_not_fit_is_refused_on_one_line(tmp_path, content):
+    path = tmp_path / "systematic.npz"
+    np.savez(path, **content)
+    with pytest.raises(FileError, match="again") as error:
+        load_fields(path)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_archive_is_refused(tmp_path):
+    path = tmp_path / "systematic.npz"
+    path.write_bytes(b"no archive")
+    with pytest.raises(FileError, match="damaged"):
+        load_fields(path)
