@@ -37,7 +37,7 @@ def load_fields(path: Path | str) -> ScanFields:
     if len(raw) > MAX_BYTES:
         raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
     try:
-        with np.load(io.BytesIO(raw), allow_pickle=False) as content:
+        with np.load(io.BytesIO(raw)) as content:  # no pickles, by default
             names, fields, every = (content[name] for name in _NAMES)
         found = ScanFields(tuple(map(str, names)), fields.astype(np.float64), int(every))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
