@@ -9,25 +9,24 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import Status
+from omsm_ros.devices.block_stream import BlockStreamDevice
 from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.devices.command_port import CommandPort
-from omsm_ros.devices.counting import SAMPLE, Counting, Samples
-from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.counting import SAMPLE, Samples
 from omsm_ros.devices.transport import Transport
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
-from omsm_ros.protocols.micro_epsilon import Block, BlockDecoder, channel_dtype
+from omsm_ros.protocols.micro_epsilon import channel_dtype
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S
 
 PROMPTS = (b"OK\r\n", b"$WRONG", b"$UNKNOWN")
 # A channel's 24 bits are its measuring range.
 FULL_SCALE = 0xFFFFFF
-_COUNTER_RANGE = 2**32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +50,10 @@ class CapaNcdtSettings(BlockSettings):
             raise ConfigurationError(f"channel {self.channel!r}, expected 1 to 8")
 
 
-class CapaNcdtDevice(StreamDevice):
+class CapaNcdtDevice(BlockStreamDevice):
     """Reads one channel, and sets the sample time where there is a command port."""
+
+    prompts = PROMPTS
 
     def __init__(
         self,
@@ -65,31 +66,23 @@ class CapaNcdtDevice(StreamDevice):
         """commands: the controller's port 23; None = leave it as it is set."""
         settings = settings or CapaNcdtSettings()
         free = not settings.triggered
-        period = settings.sample_period if free else 0.0
-        counting = Counting(_COUNTER_RANGE, timed=False, period=period)
-        base = replace(settings, free_running=free)
-        super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
+        super().__init__(
+            transport,
+            replace(settings, free_running=free),
+            Channels(timed=False),
+            kind="capacitive",
+            period=settings.sample_period if free else 0.0,
+            patience=settings.patience,
+            commands=commands,
+            now_ns=now_ns,
+            monotonic=monotonic,
+        )
         self._wanted = settings
-        self._decoder = BlockDecoder("capacitive", _dtype)
-        self._commands = commands
-        self._identity: dict[str, str] = {}
 
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """Return what the controller told of itself."""
-        return self._identity
-
-    def _prepare(self) -> None:
-        self._decoder.reset()
-        if self._commands is None:
-            return
-        with CommandPort(self._commands, PROMPTS, self._wanted.patience, self._monotonic) as port:
-            self._identity = {"model": port.ask("$VER", "\r").strip()}
-            self._set_sample_time(port)
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        identity = {"model": port.ask("$VER", "\r").strip()}
+        self._set_sample_time(port)
+        return identity
 
     def _set_sample_time(self, port: CommandPort) -> None:
         """The controller takes the next time it has, and says which."""
@@ -107,13 +100,12 @@ class CapaNcdtDevice(StreamDevice):
             )
         port.ask(f"$TRG{int(self._wanted.triggered)}", "\r")
 
-    def _decode(self, data: bytes) -> Samples:
-        parts = [self._samples(block) for block in self._decoder.feed(data)]
-        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        return channel_dtype(kind[0])
 
-    def _samples(self, block: Block) -> Samples:
-        frames = block.frames.reshape(-1).view(_dtype(block.kind))
-        self._identity |= {"order": str(block.order), "serial": str(block.serial)}
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
         name = f"channel {self._wanted.channel}"
         if name not in (frames.dtype.names or ()):
             raise DeviceError(
@@ -121,7 +113,7 @@ class CapaNcdtDevice(StreamDevice):
             )
         value = frames[name].astype(np.float64)
         samples = np.zeros(len(frames), SAMPLE)
-        samples["counter"] = (block.counter + np.arange(len(frames))) % _COUNTER_RANGE
+        samples["counter"] = counter
         raw = value * (self._wanted.probe.full_scale / FULL_SCALE)
         samples["distance"] = self._wanted.probe.distance(raw)
         samples["intensity"] = np.nan
@@ -134,7 +126,3 @@ class CapaNcdtDevice(StreamDevice):
             raise DeviceError(
                 f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
             )
-
-
-def _dtype(kind: tuple[int, int]) -> np.dtype[np.void]:
-    return channel_dtype(kind[0])

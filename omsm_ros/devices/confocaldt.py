@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from omsm_ros.core.samples.blocks import IntArray, Status
+from omsm_ros.devices.block_stream import COUNTER_RANGE, BlockStreamDevice
 from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.devices.command_port import CommandPort
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
@@ -24,7 +25,7 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
 from omsm_ros.protocols.confocaldt_serial import VALUE_BITS, SerialDecoder, distance_of
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling
-from omsm_ros.protocols.micro_epsilon import Block, BlockDecoder, confocal_dtype
+from omsm_ros.protocols.micro_epsilon import confocal_dtype
 from omsm_ros.units import NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
@@ -33,7 +34,6 @@ PROMPTS = (b"->",)
 _INTENSITY_MASK, _INTENSITY_FULL = 0x7FF, 1024
 # Distances from here on are error codes, not nanometres.
 _FIRST_ERROR = 0x7FFFFF00
-_COUNTER_RANGE = 2**32
 _KILOHERTZ = 1000.0
 
 
@@ -127,8 +127,10 @@ class ConfocalDtDevice(StreamDevice):
         _must_talk(self._transport.name, self._wanted, silent)
 
 
-class ConfocalDtEthernetDevice(StreamDevice):
+class ConfocalDtEthernetDevice(BlockStreamDevice):
     """Reads blocks, and sets the measuring rate where there is a command port."""
+
+    prompts = PROMPTS
 
     def __init__(
         self,
@@ -140,34 +142,26 @@ class ConfocalDtEthernetDevice(StreamDevice):
     ) -> None:
         """commands: the controller's port 23; None = leave it as it is set."""
         settings = settings or ConfocalDtSettings()
-        counting = Counting(_COUNTER_RANGE, timed=False, period=settings.period)
-        channels = Channels(axes=_wrapping(settings.axes), timed=False)
-        base = replace(settings, free_running=settings.period > 0)
-        super().__init__(transport, base, channels, counting, now_ns, monotonic)
+        super().__init__(
+            transport,
+            replace(settings, free_running=settings.period > 0),
+            Channels(axes=_wrapping(settings.axes), timed=False),
+            kind="confocal",
+            period=settings.period,
+            patience=settings.patience,
+            commands=commands,
+            now_ns=now_ns,
+            monotonic=monotonic,
+        )
         self._wanted = settings
-        self._decoder = BlockDecoder("confocal", self._dtype)
-        self._commands = commands
-        self._identity: dict[str, str] = {}
 
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        return confocal_dtype(kind, self._wanted.intensity_first)
 
-    @property
-    def identity(self) -> dict[str, str]:
-        """Return what the controller told of itself."""
-        return self._identity
-
-    def _dtype(self, flags: tuple[int, int]) -> np.dtype[np.void]:
-        return confocal_dtype(flags, self._wanted.intensity_first)
-
-    def _prepare(self) -> None:
-        self._decoder.reset()
-        if self._commands is None:
-            return
-        with CommandPort(self._commands, PROMPTS, self._wanted.patience, self._monotonic) as port:
-            self._identity = _info(port.ask("GETINFO", "\n"))
-            self._set_rate(port)
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        identity = _info(port.ask("GETINFO", "\n"))
+        self._set_rate(port)
+        return identity
 
     def _set_rate(self, port: CommandPort) -> None:
         wanted = 1 / (self._wanted.sample_period * _KILOHERTZ)
@@ -183,17 +177,12 @@ class ConfocalDtEthernetDevice(StreamDevice):
                 f"at {found[1]} kHz; set sample_period to {1e-3 / float(found[1]):.9g} s"
             )
 
-    def _decode(self, data: bytes) -> Samples:
-        parts = [self._samples(block) for block in self._decoder.feed(data)]
-        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
-
-    def _samples(self, block: Block) -> Samples:
-        frames = block.frames.reshape(-1).view(self._dtype(block.kind))
-        self._identity |= {"order": str(block.order), "serial": str(block.serial)}
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
         names = frames.dtype.names or ()
         samples = np.zeros(len(frames), SAMPLE)
-        counter = block.counter + np.arange(len(frames))
-        samples["counter"] = frames["counter"] if "counter" in names else counter % _COUNTER_RANGE
+        samples["counter"] = frames["counter"] if "counter" in names else counter
         raw = frames["distance 1"].astype(np.int64)
         nothing = raw >= _FIRST_ERROR
         metres = np.where(nothing, np.nan, raw * NANOMETRE_M)
@@ -241,4 +230,4 @@ def _wrapping(axes: tuple[AxisScaling, ...] | None) -> tuple[AxisScaling, ...] |
     """The encoders wrap with their 32 bits where nothing else is said."""
     if axes is None:
         return None
-    return tuple(replace(axis, wrap=axis.wrap or _COUNTER_RANGE) for axis in axes)
+    return tuple(replace(axis, wrap=axis.wrap or COUNTER_RANGE) for axis in axes)

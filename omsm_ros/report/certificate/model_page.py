@@ -18,7 +18,7 @@ from omsm_ros.report.certificate.page import Section
 from omsm_ros.report.certificate.tables import known_rows, texts
 from omsm_ros.report.common import style
 from omsm_ros.report.common.tables import Table, mapping_table, part
-from omsm_ros.report.common.template import fill, picture
+from omsm_ros.report.common.template import check_places, fill, picture
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.measurement.page import Headline
 
@@ -45,6 +45,8 @@ class ModelPage:
 
     date: of issue;  source: the record;  version: of the software
     figures: PNG files by the names in :data:`CAPTIONS`
+
+    Raises ConfigurationError for a figure of another name.
     """
 
     model: SampledModel
@@ -53,6 +55,9 @@ class ModelPage:
     source: str = ""
     version: str = ""
     figures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_places(self.figures, CAPTIONS)
 
 
 def model_figures_of(

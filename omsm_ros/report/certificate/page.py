@@ -11,7 +11,6 @@ from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import NOTHING, measured, number, percent, plain, quantity
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import reading as reading
@@ -19,7 +18,7 @@ from omsm_ros.report.certificate import tables as tables
 from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import step_response
 from omsm_ros.report.common.tables import Table, latency_text, mapping_table
-from omsm_ros.report.common.template import fill, picture
+from omsm_ros.report.common.template import check_places, fill, picture
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.measurement.page import Headline
 from omsm_ros.units import DEGREE_RAD, PPM
@@ -62,11 +61,7 @@ class CertificatePage:
     figures: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.figures) - set(CAPTIONS))
-        if unknown:
-            raise ConfigurationError(
-                f"figures {unknown!r} have no place on the page, expected of {[*CAPTIONS]}"
-            )
+        check_places(self.figures, CAPTIONS)
 
 
 @dataclass(frozen=True, slots=True)

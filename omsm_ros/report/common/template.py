@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
+from collections.abc import Iterable
 
 import jinja2
+
+from omsm_ros.errors import ConfigurationError
 
 _SPACE = "\N{NARROW NO-BREAK SPACE}"
 # A sign, not a hyphen: not behind a letter or a digit, so neither 1e-9 nor a date.
@@ -26,6 +29,15 @@ def fill(template: str, **content: object) -> str:
         finalize=lambda value: typeset(value) if type(value) is str else value,
     )
     return environment.get_template(template).render(**content)
+
+
+def check_places(figures: Iterable[str], places: Iterable[str]) -> None:
+    """Raise ConfigurationError for a figure whose name is none of ``places`` on a page."""
+    unknown = sorted(set(figures) - set(places))
+    if unknown:
+        raise ConfigurationError(
+            f"figures {unknown!r} have no place on the page, expected of {[*places]}"
+        )
 
 
 def picture(png: bytes) -> str:

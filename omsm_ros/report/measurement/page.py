@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import quantity
 from omsm_ros.report.common import tables
 from omsm_ros.report.common.tables import part
-from omsm_ros.report.common.template import fill, picture
+from omsm_ros.report.common.template import check_places, fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
 
 
@@ -74,11 +73,7 @@ class Report:
     figures: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.figures) - set(CAPTIONS))
-        if unknown:
-            raise ConfigurationError(
-                f"figures {unknown!r} have no place on the page, expected of {[*CAPTIONS]}"
-            )
+        check_places(self.figures, CAPTIONS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,92 @@
+"""What Micro-Epsilon's Ethernet controllers have in common: blocks of data, commands beside."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+import numpy as np
+
+from omsm_ros.devices.blocks import BlockSettings, Channels
+from omsm_ros.devices.command_port import CommandPort
+from omsm_ros.devices.counting import SAMPLE, Counting, Samples
+from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.transport import Transport
+from omsm_ros.protocols.micro_epsilon import BlockDecoder
+
+COUNTER_RANGE = 2**32
+
+
+class BlockStreamDevice(StreamDevice):
+    """Decodes blocks, and talks to the controller where there is a command port.
+
+    A model fills in ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
+    (commands), and says which prompts end an answer, and how long one may take.
+    """
+
+    prompts: tuple[bytes, ...] = ()
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: BlockSettings,
+        channels: Channels,
+        *,
+        kind: str,
+        period: float,
+        patience: float,
+        commands: Transport | None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """kind: of :class:`BlockDecoder`;  period: of a controller that runs freely [s], else 0
+        patience: for an answer [s];  commands: the controller's port 23; None = leave it as it is
+        """
+        counting = Counting(COUNTER_RANGE, timed=False, period=period)
+        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        self._decoder = BlockDecoder(kind, self._frame)
+        self._commands, self._answers_within = commands, patience
+        self._identity: dict[str, str] = {}
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Return what the controller told of itself."""
+        return self._identity
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        if self._commands is None:
+            return
+        within = self._answers_within
+        with CommandPort(self._commands, self.prompts, within, self._monotonic) as port:
+            self._identity = self._set_up(port)
+
+    def _decode(self, data: bytes) -> Samples:
+        parts = []
+        for block in self._decoder.feed(data):
+            self._identity |= {"order": str(block.order), "serial": str(block.serial)}
+            frames = block.frames.reshape(-1).view(self._frame(block.kind))
+            counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
+            parts.append(self._samples_of(frames, counter))
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    # --- what a model fills in
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        """Fields of a frame, by the flags in the block's head."""
+        raise NotImplementedError
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        """Samples (n,) of the frames (n,) of a block, counted from its head: ``counter`` (n,)."""
+        raise NotImplementedError
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        """Set what was asked for, and return what the controller tells of itself."""
+        raise NotImplementedError
