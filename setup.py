@@ -36,6 +36,7 @@ setup(
             "SurfaceTopography>=1.20",
         ],
         "campaign": ["distributed"],
+        "catalogue": ["sqlalchemy>=2", "psycopg[binary]>=3.1"],
     },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the
     # code: msg_defs/ is installed as omsm_ros/interfaces/. In a source checkout, and in a workspace

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
@@ -69,6 +70,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
     )
+    declare_catalogue(sub)
 
 
 def _identify(args: argparse.Namespace) -> Facts:
@@ -93,6 +95,7 @@ def _identify(args: argparse.Namespace) -> Facts:
     path = kept_at(args.out, facts["verdict"])
     save_calibration(path, identified.calibration)
     facts["calibration"] = str(path)
+    facts["warnings"] = [*facts["warnings"], *_remembered(args, identified.calibration, path)]
     if args.report is not None:
         # Drawing takes a second to import; most commands do without.
         from omsm_ros.jobs.certify import write_certificate
@@ -100,6 +103,15 @@ def _identify(args: argparse.Namespace) -> Facts:
         page = write_certificate(args.report, identified, source=args.recording.name)
         facts["report"] = str(page)
     return facts
+
+
+def _remembered(args: argparse.Namespace, calibration: Calibration, path: Path) -> list[str]:
+    def keep() -> bool:
+        from omsm_ros.jobs.keep_history import keep_calibration
+
+        return keep_calibration(args.catalogue, calibration, path, args.recording)
+
+    return remembered(args.catalogue, keep)
 
 
 def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:

@@ -32,6 +32,7 @@ WORDS = {
     "omsm_ros.cli.starting": ("doctor",),
     "omsm_ros.cli.importing": ("import",),
     "omsm_ros.cli.campaigning": ("batch",),
+    "omsm_ros.cli.remembering": ("history",),
     "omsm_ros.cli.exporting": ("export",),
 }
 

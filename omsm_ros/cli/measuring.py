@@ -10,6 +10,7 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -91,6 +92,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--override", action="store_true", help="use a calibration that does not belong; recorded"
     )
+    declare_catalogue(sub)
 
 
 def _correct(args: argparse.Namespace) -> Facts:
@@ -106,7 +108,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         result_folder(args.out, (CLOUD, SYSTEMATIC, REPORT, SUMMARY)) as out,
         progress_bar("correcting", args.json) as progress,
     ):
-        return measure(
+        summary = measure(
             args.bag,
             calibration,
             out,
@@ -120,6 +122,14 @@ def _correct(args: argparse.Namespace) -> Facts:
             report=not args.no_report,
             progress=progress,
         )
+    warnings = remembered(args.catalogue, lambda: _keep(args))
+    return {**summary, "warnings": [*summary["warnings"], *warnings]}
+
+
+def _keep(args: argparse.Namespace) -> bool:
+    from omsm_ros.jobs.keep_history import keep_measurement
+
+    return keep_measurement(args.catalogue, args.out, args.bag)
 
 
 def _show_correct(summary: Facts) -> None:

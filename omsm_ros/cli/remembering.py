@@ -1,0 +1,106 @@
+"""Commands about what was calibrated and measured before: history."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.cli.catalogue_option import declare_catalogue
+from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.core.verification.trend import Trend
+from omsm_ros.readable import NOTHING, count, measured, quantity
+from omsm_ros.storage.strict_json import unknown_as_null
+
+_DAY_S = 86_400.0
+_SHOWN_ROWS = 20
+
+
+def _declare_history(sub: argparse.ArgumentParser) -> None:
+    declare_catalogue(sub)
+    sub.add_argument("--machine", default="", help="this one only")
+    sub.add_argument(
+        "--add", type=Path, nargs="+", default=[], metavar="CAL.json|DIR", help="made earlier"
+    )
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="lag, gain and form over time")
+
+
+def _history(args: argparse.Namespace) -> Facts:
+    from omsm_ros.jobs.keep_history import history, keep
+
+    address = args.catalogue or "catalogue.sqlite"
+    added = sum(keep(address, path) for path in args.add)
+    found = history(address, args.machine)
+    if args.plot is not None:
+        from omsm_ros.report.campaign.history_figure import draw
+        from omsm_ros.storage.files import save_bytes
+
+        save_bytes(args.plot, draw(found))
+    return {
+        "catalogue": address.rpartition("@")[2],
+        "added": added,
+        "machines": [_plain(asdict(machine)) for machine in found],
+    }
+
+
+def _plain(machine: dict[str, Any]) -> dict[str, Any]:
+    """Times as text, for JSON."""
+    for rows in (machine["calibrations"], machine["measurements"]):
+        for row in rows:
+            for name in ("recorded_at", "added_at"):
+                row[name] = row[name] and row[name].isoformat(timespec="seconds")
+    plain = unknown_as_null(machine)
+    assert plain is not None
+    return plain
+
+
+def _show_history(facts: Facts) -> None:
+    if not facts["machines"]:
+        print(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
+    for machine in facts["machines"]:
+        print(machine["machine"] or "(machine not named in the settings)")
+        for row in machine["calibrations"][-_SHOWN_ROWS:]:
+            print(
+                f"  {row['recorded_at'] or row['added_at']}  calibration {row['id'][:8]}  "
+                f"lag {measured(row['delay'], row['delay_uncertainty'], 's')}  "
+                f"gain {row['static_gain']:.6f}  {row['verdict']}"
+            )
+        for row in machine["measurements"][-_SHOWN_ROWS:]:
+            print(
+                f"  {row['recorded_at'] or row['added_at']}  {Path(row['bag']).name}  "
+                f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
+            )
+        table(
+            [
+                ("  calibrations, measurements", _counts(machine)),
+                ("  lag drifts a day", _drift(machine["delay"], "s")),
+                ("  static gain drifts a day", _drift(machine["static_gain"], "")),
+                ("  form's rms drifts a day", _drift(machine["deviation"], "m")),
+            ]
+        )
+
+
+def _counts(machine: dict[str, Any]) -> str:
+    return f"{count(len(machine['calibrations']))}, {count(len(machine['measurements']))}"
+
+
+def _drift(found: dict[str, float] | None, unit: str) -> str:
+    if found is None:
+        return f"{NOTHING} (not evaluated: fewer than five, or no times)"
+    drift = Trend(**found)
+    low, high = (
+        quantity(s * _DAY_S, unit) if unit else f"{s * _DAY_S:.1e}" for s in (drift.low, drift.high)
+    )
+    return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
+
+
+COMMANDS = [
+    Command(
+        "history",
+        "what was calibrated and measured, and how each machine drifts",
+        _declare_history,
+        _history,
+        _show_history,
+    ),
+]

@@ -1,0 +1,162 @@
+"""What was calibrated and measured, written down; and what became of each machine over months."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros.core.verification.trend import Trend, trend
+from omsm_ros.errors import FileError
+from omsm_ros.storage import bags, strict_json
+from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.catalogue import Catalogue, time_of
+from omsm_ros.storage.files import SUMMARY, read_text
+
+_MAX_SUMMARY_BYTES = 10_000_000
+
+
+def keep_calibration(
+    address: str, calibration: Calibration, path: Path, source: Path | None = None
+) -> bool:
+    """Add a calibration, its file and the bag that it came from; False if it is there already."""
+    certificate = calibration.certificate
+    row = {
+        "id": calibration.id,
+        "recorded_at": time_of(_recorded(source)),
+        "machine": _machine(calibration.settings),
+        "verdict": verdict_of(calibration)[0],
+        "path": str(path.absolute()),
+        "source": "" if source is None else str(source.absolute()),
+        "settings": strict_json.text_of(dict(calibration.settings)),
+        "static_gain": float(calibration.static_gain),
+        "static_gain_uncertainty": _number(certificate.get("static_gain_uncertainty")),
+        "delay": float(calibration.dynamics.low_frequency_delay),
+        "delay_uncertainty": float(calibration.low_frequency_delay_uncertainty),
+        "valid_up_to": float(calibration.valid_up_to),
+        "sample_period": float(calibration.sample_period),
+    }
+    with Catalogue(address) as catalogue:
+        return catalogue.add("calibrations", row)
+
+
+def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> bool:
+    """Add the finished measurement in ``folder``, of ``bag`` if it is not where its summary says.
+
+    False if it is there already: the same summary in the same folder.
+    """
+    path = folder / SUMMARY
+    text = read_text(path, _MAX_SUMMARY_BYTES, FileError, "summary")
+    summary = strict_json.object_of(text, FileError, f"summary {str(path)!r}")
+    stream = _part(summary, "samples", "distance") or {}
+    settings = summary.get("settings") or {}
+    source = bag if bag is not None else Path(str(summary.get("bag", "")))
+    place = str(folder.absolute())
+    row = {
+        "id": hashlib.sha256(f"{place}\0{text}".encode()).hexdigest(),
+        "recorded_at": time_of(_recorded(source)),
+        "machine": _machine(settings),
+        "bag": str(source.absolute()),
+        "folder": place,
+        "version": str(_part(summary, "versions", "omsm_ros") or ""),
+        "settings": strict_json.text_of(settings),
+        "calibration": str(summary.get("calibration", "")),
+        "received": stream.get("received"),
+        "corrected": stream.get("corrected"),
+        "deviation_rms": _number(_part(summary, "deviation", "corrected", "rms_area_weighted")),
+        "deviation_peak_to_valley": _number(
+            _part(summary, "deviation", "corrected", "peak_to_valley")
+        ),
+        "dynamic_error_rms": _number(_part(summary, "dynamic_error_before", "rms")),
+        "uncertainty_median": _number(_part(summary, "uncertainty", "median")),
+    }
+    with Catalogue(address) as catalogue:
+        return catalogue.add("measurements", row)
+
+
+def keep(address: str, path: Path) -> bool:
+    """Add what lies at ``path``: a calibration's file, or the folder of a measurement."""
+    if path.is_dir():
+        return keep_measurement(address, path)
+    return keep_calibration(address, load_calibration(path), path)
+
+
+# ---------------------------------------------------------------------------------- history
+
+
+@dataclass(frozen=True, slots=True)
+class MachineHistory:
+    """One machine: its calibrations and measurements, and how its dynamics and results drift.
+
+    delay: of the lag [s/s];  static_gain: [1/s];  deviation: of the form's rms [m/s]; None where
+    fewer than five tell
+    """
+
+    machine: str
+    calibrations: list[dict[str, Any]]
+    measurements: list[dict[str, Any]]
+    delay: Trend | None
+    static_gain: Trend | None
+    deviation: Trend | None
+
+
+def history(address: str, machine: str = "") -> list[MachineHistory]:
+    """Return what the catalogue holds, machine by machine; of one, or of all."""
+    with Catalogue(address) as catalogue:
+        calibrations = catalogue.rows("calibrations", machine)
+        measurements = catalogue.rows("measurements", machine)
+    names = sorted({row["machine"] or "" for row in (*calibrations, *measurements)})
+    return [_of(name, calibrations, measurements) for name in names]
+
+
+def _of(
+    name: str, calibrations: list[dict[str, Any]], measurements: list[dict[str, Any]]
+) -> MachineHistory:
+    own = [row for row in calibrations if (row["machine"] or "") == name]
+    scans = [row for row in measurements if (row["machine"] or "") == name]
+    accepted = [row for row in own if row["verdict"] != "rejected"]
+    return MachineHistory(
+        name, own, scans,
+        _trend(accepted, "delay"), _trend(accepted, "static_gain"), _trend(scans, "deviation_rms"),
+    )  # fmt: skip
+
+
+def _trend(rows: list[dict[str, Any]], name: str) -> Trend | None:
+    values = np.array([np.nan if row[name] is None else row[name] for row in rows], np.float64)
+    times = np.array([_seconds(row["recorded_at"]) for row in rows], np.float64)
+    return trend(times, values)
+
+
+def _seconds(when: datetime | None) -> float:
+    return np.nan if when is None else (when - datetime(1970, 1, 1)).total_seconds()
+
+
+def _machine(settings: Mapping[str, object]) -> str:
+    return str(settings.get("machine", ""))[:200]
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and np.isfinite(value) else None
+
+
+def _part(content: Mapping[str, Any], *names: str) -> Any:
+    found: Any = content
+    for name in names:
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found
+
+
+def _recorded(bag: Path | None) -> int | None:
+    try:
+        if bag is None or not bag.exists():
+            return None
+        with bags.BagReader(bag) as reader:
+            return reader.start_ns
+    except (FileError, OSError):
+        return None
