@@ -15,6 +15,7 @@ from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs.keep_history import history, keep, keep_calibration, keep_measurement
 from omsm_ros.storage import bags, calibration_file
 from omsm_ros.storage.catalogue import Catalogue
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
 DAY_NS = 86_400 * 10**9
@@ -75,7 +76,7 @@ def test_a_row_holds_what_its_calibration_says(tmp_path, address, true_calibrati
 
 def _bag(path, day, block):
     axes, distance = block
-    with bags.BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         bag.write_axes(dataclasses.replace(axes, stamp_ns=day * DAY_NS))
         bag.write_distance(dataclasses.replace(distance, stamp_ns=day * DAY_NS))
     return path
