@@ -39,6 +39,7 @@ ROOMS = {
     "correction": FITTING,
     "surface": FITTING | {"correction"},
     "comparison": FITTING | {"correction", "surface"},
+    "form": FITTING | {"correction", "surface"},
     "verification": FITTING | {"fitting", "departures", "identification", "correction", "surface"},
 }
 
@@ -284,12 +285,14 @@ def test_a_broken_rule_is_told(rule, name, source, told):
 def test_a_room_that_looks_where_it_must_not_is_told(room, other):
     """The whole graph: the corridor from samples to identification, and who stands beside it."""
     order = ["samples", "dynamics", "machine", "fitting", "departures", "identification"]
-    beside = {"sampled": 6, "correction": 3, "surface": 3, "comparison": 3, "verification": 6}
+    beside = {"sampled": 6, "correction": 3, "surface": 3, "comparison": 3, "form": 3}
+    beside |= {"verification": 6}
     allowed = set(order[: order.index(room) if room in order else beside[room]]) | {room}
     on_points = {"correction", "surface"}
     allowed |= {
         "surface": {"correction"},
         "comparison": on_points,
+        "form": on_points,
         "verification": on_points,
     }.get(room, set())
     tree = ast.parse(f"from omsm_ros.core.{other}.new import anything")

@@ -12,7 +12,7 @@ import omsm_ros
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.devices import factory
-from omsm_ros.storage.machine_files import load_surface
+from omsm_ros.storage.surface_file import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 NO_PARAMETERS = {"paper_mirror", "disturbances", "limits"}

@@ -3,7 +3,6 @@
 The answers in words stand in docs/design/where-things-belong.md.
 """
 
-import importlib
 import json
 import shutil
 import subprocess
@@ -24,7 +23,7 @@ from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface import nominal
-from omsm_ros.storage import machine_files
+from omsm_ros.storage.surface_file import load_surface
 
 PACKAGE = Path(omsm_ros.__file__).resolve().parent
 
@@ -50,19 +49,12 @@ class Cylinder:
 def test_a_nominal_surface_is_added_in_core_surface(monkeypatch, tmp_path):
     """One entry of SHAPES: its YAML has the names of its fields, and bad ones are refused."""
     monkeypatch.setitem(nominal.SHAPES, "cylinder", Cylinder)
-    files = importlib.reload(machine_files)
     path = tmp_path / "surface.yaml"
     path.write_text("shape: cylinder\ncurvature: 2.0\n")
-    assert files.load_surface(path).height(np.array([3.0]), np.array([1.0])) == [9.0]
+    assert load_surface(path).height(np.array([3.0]), np.array([1.0])) == [9.0]
     path.write_text("shape: cylinder\nradius: 2.0\n")
     with pytest.raises(omsm_ros.errors.SurfaceError, match="radius"):
-        files.load_surface(path)
-
-
-@pytest.fixture(autouse=True)
-def shapes_as_they_were():
-    yield
-    importlib.reload(machine_files)
+        load_surface(path)
 
 
 # ------------------------------------------------------------- a residual test, a further doubt

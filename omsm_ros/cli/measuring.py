@@ -25,10 +25,11 @@ from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, SYSTEMATIC
-from omsm_ros.storage.machine_files import load_geometry, load_limits, load_surface
+from omsm_ros.storage.machine_files import load_geometry, load_limits
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.sources_file import load_sources
+from omsm_ros.storage.surface_file import load_surface
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 

@@ -1,4 +1,4 @@
-"""``SURFACE.yaml``, ``GEOMETRY.yaml``, ``LIMITS.yaml``: the part, the probe, the machine."""
+"""``GEOMETRY.yaml``, ``LIMITS.yaml``: the probe, the machine."""
 
 from __future__ import annotations
 
@@ -11,26 +11,14 @@ import yaml
 
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.surface.nominal import SHAPES
-from omsm_ros.errors import ConfigurationError, FileError, SurfaceError
+from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text, save_text
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 
 MAX_YAML_BYTES = 100_000
-_SHAPE = form({"shape": {"enum": sorted(SHAPES)}}, ("shape",))
 
 _T = TypeVar("_T")
-
-
-def load_surface(path: Path | str) -> Surface:
-    """Read ``SURFACE.yaml``: ``shape`` and its parameters in metres; SurfaceError if malformed."""
-    what = f"surface {str(path)!r}"
-    description = _read_mapping(path, "surface", SurfaceError)
-    shape = description.pop("shape", None)
-    check_form({"shape": shape}, _SHAPE, SurfaceError, what)
-    return _made(SHAPES[shape], description, SurfaceError, f"{what}: {shape}")
 
 
 def load_geometry(path: Path | str) -> Geometry:
@@ -59,7 +47,7 @@ def _made(
     check_form(values, form({p.name: NUMBER for p in parameters}, required), error, what)
     try:
         return kind(**values)
-    except (ConfigurationError, SurfaceError) as err:
+    except ConfigurationError as err:
         raise error(f"{what}: {err}") from err
 
 

@@ -8,7 +8,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import CalibrationError, FileError, SurfaceError
-from omsm_ros.storage import calibration_file, cloud_file, files, machine_files
+from omsm_ros.storage import calibration_file, cloud_file, files, machine_files, surface_file
 
 
 @pytest.fixture
@@ -188,7 +188,7 @@ def test_surface_file(tmp_path):
     path.write_text(
         "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
     )
-    assert machine_files.load_surface(path) == PAPER_MIRROR
+    assert surface_file.load_surface(path) == PAPER_MIRROR
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_surface_file(tmp_path):
         ("- 1\n", "expected 'name: value'"),
         ("shape: [", "plain YAML"),
         ("shape: !!python/name:os.system x\n", "tag"),
-        ("radius: 1.0\n", "shape is None"),
+        ("radius: 1.0\n", "shape is required"),
         ("shape: cube\n", "cube"),
         ("shape: [sphere]\n", r"\['sphere'\]"),
         ("shape: sphere\n", "radius is required"),
@@ -212,7 +212,7 @@ def test_a_wrong_surface_file_is_refused_by_name(tmp_path, text, named):
     path = tmp_path / "mirror.yaml"
     path.write_text(text)
     with pytest.raises(SurfaceError, match=named) as caught:
-        machine_files.load_surface(path)
+        surface_file.load_surface(path)
     assert "mirror.yaml" in str(caught.value)
 
 

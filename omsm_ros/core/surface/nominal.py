@@ -13,6 +13,10 @@ import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
+from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, ZernikeSurface
+from omsm_ros.core.surface.posed import OffAxisSection, Sum
+from omsm_ros.core.surface.slopes import Gradient
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import FOCAL_LENGTH, LENGTH, RADIUS
 
@@ -30,6 +34,11 @@ class Flat:
         """Height [m] at x, y [m]."""
         return np.full(np.broadcast(x, y).shape, self.level)
 
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        zero = np.zeros(np.broadcast(x, y).shape)
+        return zero, zero
+
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
@@ -46,6 +55,10 @@ class Sphere:
         root = np.sqrt(np.maximum(self.radius**2 - square, 0.0))
         sag = np.sign(self.radius) * square / (abs(self.radius) + root)
         return np.where(square <= self.radius**2, sag, np.nan)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
+        return Asphere(self.radius).gradient(x, y)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +82,27 @@ class OffAxisParaboloid:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
+        b, c, root, _ = self._quadratic(x, y)
+        # 2c / (b + √…) is the small root without the cancellation of (b - √…) / 2a.
+        return np.asarray(2 * c / (b + root), np.float64)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Slopes ∂z/∂x, ∂z/∂y [1]: of ``a w² − b w + c = 0``, differentiated."""
+        b, c, root, slope = self._quadratic(x, y)
+        q2 = 1 + slope**2
+        w = 2 * c / (b + root)
+        along_x = 2 * (np.asarray(x) - slope * w) / (q2 * root)
+        return np.asarray(along_x), np.asarray(2 * np.asarray(y) / root)
+
+    def _quadratic(
+        self, x: FloatArray, y: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Return b, c, √(b² − 4ac) and the slope m of ``a w² − b w + c = 0``, a = m²/q²."""
         slope = self.off_axis_distance / (2 * self.parent_focal_length)
         q2 = 1 + slope**2
-        a = slope**2 / q2
         b = 2 * slope / q2 * np.asarray(x) + 4 * self.parent_focal_length * np.sqrt(q2)
         c = np.square(x) / q2 + np.square(y)
-        # 2c / (b + √…) is the small root without the cancellation of (b - √…) / 2a.
-        return np.asarray(2 * c / (b + np.sqrt(b**2 - 4 * a * c)), np.float64)
+        return b, c, np.sqrt(b**2 - 4 * slope**2 / q2 * c), slope
 
 
 PAPER_MIRROR = OffAxisParaboloid(parent_focal_length=25.4e-3, off_axis_distance=50.8e-3)
@@ -87,5 +114,14 @@ SHAPES: dict[str, Callable[..., Surface]] = {
     "flat": Flat,
     "sphere": Sphere,
     "off_axis_paraboloid": OffAxisParaboloid,
+    "asphere": Asphere,
+    "toroid": Toroid,
+    "biconic": Biconic,
+    "xy_polynomial": XYPolynomial,
+    "zernike": ZernikeSurface,
+    "q_bfs": QBfs,
+    "q_con": QCon,
+    "off_axis_section": OffAxisSection,
+    "sum": Sum,
 }
 """The surfaces by the name that a description gives their ``shape``."""

@@ -1,0 +1,1 @@
+"""What shape does the part have? Figures of a registered deviation, each with its uncertainty."""

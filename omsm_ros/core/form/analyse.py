@@ -1,0 +1,179 @@
+"""From scattered points and a nominal surface to the form of the part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.form.figures import (
+    DeviationMap,
+    Figure,
+    noise_of,
+    peak_to_valley,
+    robust_peak_to_valley,
+    root_mean_square,
+)
+from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.surface.area_weights import area_weights
+from omsm_ros.core.surface.placement import (
+    Aperture,
+    Placed,
+    Placement,
+    Portion,
+    Portions,
+    freedom_columns,
+    placed,
+)
+from omsm_ros.core.surface.registration import CHUNK, Registration, register
+from omsm_ros.core.surface.zernike_terms import first_terms
+from omsm_ros.errors import DataError
+
+ZERNIKES = first_terms(37, "fringe")
+# Twelve numbers each make 50 MB. Extremes and counts are of all points.
+MOST_WEIGHED = 2**19
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Form:
+    """The form of a part.
+
+    registration: how it sits;  aperture: the disc of the part on which it is judged
+    map: its deviations, of all points or of half a million and more, evenly chosen
+    deviation: figures by their name [m];  zernike: terms of the deviation, one at the rim
+    counts: of the points, by what became of them; they add up to "read"
+    """
+
+    registration: Registration
+    aperture: Aperture
+    map: DeviationMap
+    deviation: dict[str, Figure]
+    zernike: ZernikeFit
+    counts: dict[str, int]
+
+
+def analyse_form(
+    surface: Surface,
+    portions: Portions,
+    asked: Sequence[str],
+    *,
+    sources: Sequence[str] = (),
+    aperture: Aperture | None = None,
+) -> Form:
+    """Register the points and judge what they deviate by.
+
+    portions: reads the points, see :class:`omsm_ros.core.surface.placement.Portion`
+    asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
+    aperture: of the part; None: the disc about the part's origin that holds all points
+
+    Raises DataError for points that are too few, do not fit, or do not determine a freedom.
+    """
+    found = register(surface, portions, asked, sources=sources, aperture=aperture)
+    gathered = _Gathered(surface, found, aperture, len(sources))
+    for portion in portions():
+        for begin in range(0, len(portion.x), CHUNK):
+            gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
+    map_ = gathered.map(found)
+    points = (map_.x, map_.y, map_.deviation)
+    zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
+    return Form(
+        registration=found,
+        aperture=found.disc,
+        map=map_,
+        deviation=_figures(map_, gathered, found),
+        zernike=zernike,
+        counts=gathered.counts,
+    )
+
+
+def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> dict[str, Figure]:
+    rms, clean = root_mean_square(map_)
+    return {
+        "peak_to_valley": peak_to_valley(map_, gathered.extent),
+        "robust_peak_to_valley": robust_peak_to_valley(map_),
+        "rms": rms,
+        "rms_without_noise": clean,
+        "point_noise": Figure(map_.noise, None),
+        # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
+        "rms_before_fit": Figure(found.before, None),
+    }
+
+
+class _Gathered:
+    """The points in the part's frame, while they pass."""
+
+    def __init__(
+        self, surface: Surface, found: Registration, aperture: Aperture | None, sources: int
+    ) -> None:
+        self._surface, self._found, self._aperture = surface, found, aperture
+        self._sources = sources
+        self._kept = EvenSelection(MOST_WEIGHED)
+        self._least, self._most = np.inf, -np.inf
+        self._noise: list[float] = []
+        self.counts = dict.fromkeys(
+            ("read", "used", "not_finite", "beyond_surface", "outside_aperture", "outliers"), 0
+        )
+
+    def add(self, portion: Portion) -> None:
+        """Take in the next points."""
+        finite = np.isfinite(portion.x) & np.isfinite(portion.y) & np.isfinite(portion.height)
+        at, found = self._found.placement, self._found
+        whole = placed(self._surface, at, portion)
+        has_height = np.isfinite(whole.deviation)
+        inside = np.ones(len(finite), bool)
+        if self._aperture is not None:
+            inside = self._aperture.holds(whole.x, whole.y)
+        good = np.zeros(len(finite), bool)
+        chosen = has_height & inside
+        good[chosen] = found.good(whole.part(chosen))
+        self._count(finite, has_height, inside, good)
+        if np.any(good):
+            self._keep(at, whole.part(good), portion.systematic[:, good])
+
+    def _count(
+        self, finite: BoolArray, has_height: BoolArray, inside: BoolArray, good: BoolArray
+    ) -> None:
+        for name, chosen in (
+            ("read", np.ones(len(good), bool)),
+            ("used", good),
+            ("not_finite", ~finite),
+            ("beyond_surface", finite & ~has_height),
+            ("outside_aperture", has_height & ~inside),
+            ("outliers", has_height & inside & ~good),
+        ):
+            self.counts[name] += int(np.count_nonzero(chosen))
+
+    def _keep(self, at: Placement, points: Placed, systematic: FloatArray) -> None:
+        self._least = min(self._least, float(points.deviation.min()))
+        self._most = max(self._most, float(points.deviation.max()))
+        self._noise.append(noise_of(points.deviation))
+        names = self._found.freedoms.fitted
+        columns = freedom_columns(at, points, names)
+        pose = self._found.pose_effects @ columns
+        # What a source does to the heights, and what the pose that follows it takes away again.
+        along = systematic * points.normal[2] + self._found.moved.T @ columns
+        rows = [points.x, points.y, points.deviation, *pose, *along]
+        self._kept.add(np.stack(rows, axis=1))
+
+    @property
+    def extent(self) -> float:
+        """Largest minus smallest deviation of all points [m]."""
+        return float(self._most - self._least)
+
+    def map(self, found: Registration) -> DeviationMap:
+        """Return the deviations gathered. Raises DataError if there are none."""
+        if not self.counts["used"]:
+            raise DataError(f"no point can be used: {self.counts!r}; check aperture and surface")
+        rows = np.ascontiguousarray(self._kept.rows().T)
+        return DeviationMap(
+            x=rows[0],
+            y=rows[1],
+            deviation=rows[2],
+            area=area_weights(rows[0], rows[1]),
+            effects=rows[3:],
+            noise=min(float(np.median(self._noise)), found.noise),
+        )

@@ -1,0 +1,159 @@
+"""Zernike polynomials of scattered points, with their covariance.
+
+Normal equations in portions that stay in the processor's cache, solved by Cholesky once they are
+found well conditioned: an equilibrated Gram matrix of condition κ costs κ times the rounding of a
+float, so that 10⁶ leaves ten digits. Where the points cover too little of the disc for the terms to
+be told apart, those of highest order are left out, and are not evaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.surface.zernike_terms import Term, zernike_values
+from omsm_ros.errors import DataError
+
+CHUNK = 8192
+# Ten digits are left, more than any of them is worth.
+_WORST_CONDITION = 1e6
+# Consecutive points whose errors may hang together: half a turn of the paper's scan has a thousand.
+_GROUP, _LEAST_GROUPS = 128, 4
+
+
+@dataclass(frozen=True, eq=False)
+class ZernikeFit:
+    """Coefficients (k,) [m] of ``terms``, each one at the rim of ``disc``.
+
+    covariance: from the scatter of the points about the fit (k, k) [m²]
+    left_out: terms that the points do not tell apart
+    effects: coefficients of the further deviations (k, e) [m]
+    """
+
+    disc: Aperture
+    terms: tuple[Term, ...]
+    coefficients: FloatArray
+    covariance: FloatArray
+    left_out: tuple[Term, ...]
+    effects: FloatArray
+
+    @property
+    def uncertainty(self) -> FloatArray:
+        """Standard uncertainty of each coefficient (k,) [m], by scatter and all effects."""
+        variance = np.diag(self.covariance) + np.sum(self.effects**2, axis=1)
+        return np.asarray(np.sqrt(variance), np.float64)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the sum of the terms [m] at x, y (n,) [m]."""
+        made = np.empty(len(x))
+        for begin in range(0, len(x), CHUNK):
+            chunk = slice(begin, begin + CHUNK)
+            u, v = self.disc.scaled(x[chunk], y[chunk])
+            made[chunk] = self.coefficients @ zernike_values(u, v, self.terms)
+        return made
+
+
+def fit_zernikes(
+    x: FloatArray,
+    y: FloatArray,
+    deviation: FloatArray,
+    terms: Sequence[Term],
+    disc: Aperture,
+    *,
+    weights: FloatArray | None = None,
+    effects: FloatArray | None = None,
+) -> ZernikeFit:
+    """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
+
+    weights: the area of each point (n,); None: every point alike
+    effects: further deviations (e, n) [m] whose coefficients (k, e) are wanted of the same fit
+
+    The covariance holds errors that hang together over 128 successive points. Raises DataError for
+    fewer points than terms, or points that tell no term.
+    """
+    if len(x) < max(2 * len(terms), 8):
+        raise DataError(
+            f"{len(x)} points for {len(terms)} Zernike terms, expected {max(2 * len(terms), 8)} or "
+            "more; measure more points or ask for fewer terms"
+        )
+    more = np.empty((0, len(x))) if effects is None else effects
+    values = np.concatenate([deviation[np.newaxis], more])
+    gram, right = _normal_equations(x, y, values, terms, disc, weights)
+    told = _told_apart(gram, terms)
+    gram, right = gram[np.ix_(told, told)], right[told]
+    used = tuple(terms[k] for k in told)
+    scale = 1 / np.sqrt(np.diag(gram))
+    root = np.linalg.cholesky(gram * np.outer(scale, scale))
+    inverse = np.linalg.inv(root) * scale
+    inverse = inverse.T @ inverse
+    found = scale[:, np.newaxis] * np.linalg.solve(
+        root.T, np.linalg.solve(root, scale[:, np.newaxis] * right)
+    )
+    scores = _scores(x, y, deviation, found[:, 0], used, disc, weights)
+    return ZernikeFit(
+        disc=disc,
+        terms=used,
+        coefficients=found[:, 0],
+        covariance=inverse @ scores @ inverse,
+        left_out=tuple(t for t in terms if t not in used),
+        effects=found[:, 1:],
+    )
+
+
+def _normal_equations(
+    x: FloatArray,
+    y: FloatArray,
+    values: FloatArray,
+    terms: Sequence[Term],
+    disc: Aperture,
+    weights: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    gram, right = np.zeros((len(terms), len(terms))), np.zeros((len(terms), len(values)))
+    for begin in range(0, len(x), CHUNK):
+        chunk = slice(begin, begin + CHUNK)
+        columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
+        weighted = columns if weights is None else columns * weights[chunk]
+        gram += weighted @ columns.T
+        right += weighted @ values[:, chunk].T
+    return gram, right
+
+
+def _told_apart(gram: FloatArray, terms: Sequence[Term]) -> list[int]:
+    """Return the places of the terms up to the highest order that is well conditioned."""
+    for order in range(max(t.n for t in terms), -1, -1):
+        told = [k for k, t in enumerate(terms) if t.n <= order]
+        own = np.diag(gram)[told]
+        if np.all(own > 0):
+            scale = 1 / np.sqrt(own)
+            values = np.linalg.eigvalsh(gram[np.ix_(told, told)] * np.outer(scale, scale))
+            if values[0] > 0 and values[-1] / values[0] < _WORST_CONDITION:
+                return told
+    raise DataError("the points tell no Zernike term; check the aperture and the weights")
+
+
+def _scores(
+    x: FloatArray,
+    y: FloatArray,
+    deviation: FloatArray,
+    coefficients: FloatArray,
+    terms: Sequence[Term],
+    disc: Aperture,
+    weights: FloatArray | None,
+) -> FloatArray:
+    """Return the covariance (k, k) of columns times residual, by groups of successive points."""
+    size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * len(terms) else 1
+    total = np.zeros((len(terms), len(terms)))
+    for begin in range(0, len(x), CHUNK):
+        chunk = slice(begin, begin + CHUNK)
+        columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
+        residual = deviation[chunk] - coefficients @ columns
+        columns *= residual if weights is None else residual * weights[chunk]
+        sums = np.add.reduceat(columns, np.arange(0, columns.shape[1], size), axis=1)
+        total += sums @ sums.T
+    groups = max(-(-len(x) // size), 2)
+    freedom = max(1 - len(terms) / len(x), 1e-3)
+    return np.asarray(total * groups / (groups - 1) / freedom, np.float64)

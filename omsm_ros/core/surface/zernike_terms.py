@@ -1,0 +1,152 @@
+"""Zernike circle polynomials: their numbering, their values and their slopes.
+
+``Z_n^m = R_n^|m|(ρ) cos mθ`` for m ≥ 0 and ``R_n^|m|(ρ) sin |m|θ`` for m < 0, with θ from x
+towards y, and ``R(1) = 1`` (ISO 14999-2; "peak"). Noll's and ANSI Z80.28's are these times
+``sqrt((2 − δ_m0)(n + 1))``, of root mean square one over the disc ("rms").
+
+``R_n^m(ρ) = ρ^m P_k^(0,m)(2ρ² − 1)``, ``k = (n − m)/2``: the angular part with its ρ^m is a power
+of x + i y, and the Jacobi polynomials P come by their recurrence of three terms, so that no angle
+and no factorial is ever computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.samples.blocks import FloatArray
+
+Norm: TypeAlias = Literal["peak", "rms"]
+Indexing: TypeAlias = Literal["noll", "fringe", "ansi"]
+
+
+MOST_FRINGE = 37
+
+
+class Term(NamedTuple):
+    """One polynomial: ``n`` radial order, ``m`` angular order, negative for sines."""
+
+    n: int
+    m: int
+
+
+def noll(j: int) -> Term:
+    """Return the term of Noll's number j = 1, 2, … (J. Opt. Soc. Am. 66, 207)."""
+    n = int((np.sqrt(8 * j - 7) - 1) // 2)
+    place = j - n * (n + 1) // 2 - 1
+    m = 2 * ((place + 1) // 2) if n % 2 == 0 else 2 * (place // 2) + 1
+    return Term(n, m if j % 2 == 0 else -m)
+
+
+def fringe(j: int) -> Term:
+    """Return the term of the Fringe number j = 1 to 37 (University of Arizona; ISO 14999-2).
+
+    Its last is the symmetric one of order twelve, out of turn, and there are no others.
+    """
+    if j == MOST_FRINGE:
+        return Term(12, 0)
+    half = int(np.ceil(np.sqrt(j))) - 1
+    place = j - half**2 - 1
+    m = half - place // 2
+    return Term(2 * half - m, m if place % 2 == 0 else -m)
+
+
+def ansi(j: int) -> Term:
+    """Return the term of the ANSI Z80.28 number j = 0, 1, …"""
+    n = int((np.sqrt(8 * j + 1) - 1) // 2)
+    return Term(n, 2 * j - n * (n + 2))
+
+
+NUMBERING: dict[str, tuple[Callable[[int], Term], int]] = {
+    "noll": (noll, 1),
+    "fringe": (fringe, 1),
+    "ansi": (ansi, 0),
+}
+"""Each numbering with the number that it begins with."""
+
+
+def first_terms(count: int, indexing: Indexing = "fringe") -> tuple[Term, ...]:
+    """Return the first ``count`` terms of a numbering."""
+    term_of, first = NUMBERING[indexing]
+    return tuple(term_of(j) for j in range(first, first + count))
+
+
+def terms_up_to(order: int, least: int = 0) -> tuple[Term, ...]:
+    """Return all terms of radial orders ``least`` to ``order``."""
+    return tuple(Term(n, m) for n in range(least, order + 1) for m in range(-n, n + 1, 2))
+
+
+def rms_of(term: Term) -> float:
+    """Return the root mean square over the disc of a term that is one at the rim."""
+    return float(1 / np.sqrt((1 if term.m == 0 else 2) * (term.n + 1)))
+
+
+def _jacobi(
+    t: FloatArray, m: int, highest: int, slopes: bool
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield P_k^(0,m)(t) and its derivative, zero unless asked for, for k = 0 to ``highest``."""
+    before, value = np.zeros_like(t), np.ones_like(t)
+    before_slope, slope = np.zeros_like(t), np.zeros_like(t)
+    yield value, slope
+    for k in range(highest):
+        if k == 0:
+            a, b, c = (m + 2) / 2, -m / 2, 0.0
+        else:
+            scale = 2 * (k + 1) * (k + 1 + m) * (2 * k + m)
+            a = (2 * k + m + 1) * (2 * k + m + 2) * (2 * k + m) / scale
+            b = -(2 * k + m + 1) * m**2 / scale
+            c = 2 * k * (k + m) * (2 * k + m + 2) / scale
+        factor = a * t + b
+        if slopes:
+            slope, before_slope = factor * slope + a * value - c * before_slope, slope
+        value, before = factor * value - c * before, value
+        yield value, slope
+
+
+def _by_angle(terms: Sequence[Term]) -> dict[int, list[tuple[int, int, bool]]]:
+    """Return, by |m|, the place of each term, its k, and whether it is a sine."""
+    found: dict[int, list[tuple[int, int, bool]]] = {}
+    for place, (n, m) in enumerate(terms):
+        found.setdefault(abs(m), []).append((place, (n - abs(m)) // 2, m < 0))
+    return found
+
+
+def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[Term]) -> FloatArray:
+    """Return the terms (k, n), one at the rim, at x, y (n,) of the unit disc."""
+    made = np.empty((len(terms), *np.shape(x)))
+    t = 2 * (x**2 + y**2) - 1
+    base, power = x + 1j * y, np.ones_like(x, np.complex128)
+    groups = _by_angle(terms)
+    for m in range(max(groups, default=0) + 1):
+        wanted = groups.get(m, ())
+        radial = [value for value, _ in _jacobi(t, m, max((k for _, k, _ in wanted), default=0),
+                                                False)] if wanted else []  # fmt: skip
+        for place, k, sine in wanted:
+            np.multiply(radial[k], power.imag if sine else power.real, out=made[place])
+        power = power * base
+    return made
+
+
+def zernike_slopes(
+    x: FloatArray, y: FloatArray, terms: Sequence[Term]
+) -> tuple[FloatArray, FloatArray]:
+    """Return ∂Z/∂x and ∂Z/∂y, each (k, n), of the terms at x, y (n,) of the unit disc."""
+    along_x, along_y = (np.empty((len(terms), *np.shape(x))) for _ in range(2))
+    t, base = 2 * (x**2 + y**2) - 1, x + 1j * y
+    for m, wanted in _by_angle(terms).items():
+        power = base**m
+        # d(x + iy)^m: along x it is m (x + iy)^(m-1), along y i times that.
+        turned = m * base ** max(m - 1, 0)
+        radial = list(_jacobi(t, m, max(k for _, k, _ in wanted), True))
+        for place, k, sine in wanted:
+            value, slope = radial[k]
+            along_x[place] = _part(turned, sine) * value + 4 * x * _part(power, sine) * slope
+            along_y[place] = _part(1j * turned, sine) * value + 4 * y * _part(power, sine) * slope
+    return along_x, along_y
+
+
+def _part(values: NDArray[np.complex128], sine: bool) -> FloatArray:
+    return np.asarray(values.imag if sine else values.real)

@@ -1,0 +1,98 @@
+"""``SURFACE.yaml``: what a part should be.
+
+``shape`` and the parameters of that shape under the names of its fields, in metres and radians; a
+``pose`` if the part does not sit at the origin of the machine. The schema is read off the fields of
+the shape's record, so that a new shape has its own without a line here.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.surface.nominal import SHAPES
+from omsm_ros.core.surface.posed import Pose, PosedSurface
+from omsm_ros.errors import ConfigurationError, SurfaceError
+from omsm_ros.quantities import shown
+from omsm_ros.storage import strict_yaml
+from omsm_ros.storage.files import read_text
+from omsm_ros.storage.schemas import NUMBER, check_form, form
+
+MAX_YAML_BYTES = 100_000
+_INTEGER: Mapping[str, Any] = {"type": "integer"}
+_LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
+
+
+def load_surface(path: Path | str) -> Surface:
+    """Read ``SURFACE.yaml``; SurfaceError if it is malformed."""
+    text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
+    what = f"surface {str(path)!r}"
+    return surface_of(strict_yaml.mapping_of(text, SurfaceError, what), what)
+
+
+def surface_of(description: Mapping[str, Any], what: str) -> Surface:
+    """Return the surface of a description, which messages call ``what``."""
+    values = dict(description)
+    shape, pose = values.pop("shape", None), values.pop("pose", None)
+    named = {"shape": shape} if shape is not None else {}
+    check_form(named, form({"shape": {"enum": sorted(SHAPES)}}, ("shape",)), SurfaceError, what)
+    surface: Surface = _record(SHAPES[shape], values, f"{what}: {shape}")
+    if pose is None:
+        return surface
+    return PosedSurface(surface, _value(Pose, pose, f"{what}: pose"))
+
+
+def _record(kind: Any, values: Mapping[str, Any], what: str) -> Any:
+    """Return a record of ``kind`` made of ``values`` under the names of its fields."""
+    known = [each for each in fields(kind) if each.init]
+    hints = get_type_hints(kind)
+    required = [each.name for each in known if each.default is MISSING]
+    schema = form({each.name: _schema(hints[each.name]) for each in known}, required)
+    check_form(values, schema, SurfaceError, what)
+    made = {n: _value(hints[n], v, f"{what}: {n}") for n, v in values.items()}
+    try:
+        return kind(**made)
+    except (ConfigurationError, SurfaceError) as err:
+        raise SurfaceError(f"{what}: {err}") from err
+
+
+def _schema(hint: Any) -> Mapping[str, Any]:
+    """Return what JSON may stand for a value of this type."""
+    if _choices(hint):
+        return {"enum": list(_choices(hint))}
+    if get_origin(hint) is tuple:
+        return _LIST
+    return {int: _INTEGER, float: NUMBER}.get(_present(hint), {})
+
+
+def _value(hint: Any, value: Any, what: str) -> Any:
+    """Return the foreign ``value`` as one of the type ``hint``."""
+    if value is None and _present(hint) is not hint:
+        return None
+    kind = _present(hint)
+    if get_origin(kind) is tuple:
+        return tuple(_value(get_args(kind)[0], v, f"{what}[{k}]") for k, v in enumerate(value))
+    if kind is float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise SurfaceError(f"{what} is {shown(value)}, expected a number")
+        return float(value)
+    if kind is Surface or is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise SurfaceError(f"{what} is {shown(value)}, expected names and values")
+        return surface_of(value, what) if kind is Surface else _record(kind, value, what)
+    return value
+
+
+def _present(hint: Any) -> Any:
+    """Return the type of a value that may also be absent."""
+    if get_origin(hint) in (types.UnionType, Union):
+        return next(kind for kind in get_args(hint) if kind is not types.NoneType)
+    return hint
+
+
+def _choices(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) is Literal else ()

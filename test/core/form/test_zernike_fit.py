@@ -1,0 +1,80 @@
+"""Against plain least squares of the whole design matrix, and against chance."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.form.zernike_fit import fit_zernikes
+from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.surface.zernike_terms import first_terms, zernike_values
+from omsm_ros.errors import DataError
+
+DISC, TERMS = Aperture(12.7e-3, 1e-4, -2e-4), first_terms(37)
+
+
+def scattered(points=20_000, seed=1):
+    rng = np.random.default_rng(seed)
+    r, angle = 12.7e-3 * rng.uniform(0, 1, points), rng.uniform(0, 2 * np.pi, points)
+    return r * np.cos(angle) + DISC.x, r * np.sin(angle) + DISC.y, rng
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_it_is_the_least_squares_of_the_whole_matrix(weighted):
+    """To a billionth of the extent, with a form that the terms cannot describe."""
+    x, y, rng = scattered()
+    value = 1e-7 * np.sin(2000 * x) * np.cos(900 * y) + rng.normal(0, 1e-8, len(x))
+    weights = rng.uniform(0.1, 3, len(x)) if weighted else None
+    found = fit_zernikes(x, y, value, TERMS, DISC, weights=weights)
+    design = zernike_values(*DISC.scaled(x, y), TERMS).T
+    root = np.ones(len(x)) if weights is None else np.sqrt(weights)
+    expected = np.linalg.lstsq(design * root[:, np.newaxis], value * root, rcond=None)[0]
+    np.testing.assert_allclose(found.coefficients, expected, atol=1e-9 * np.ptp(value), rtol=0)
+    np.testing.assert_allclose(found.height(x, y), design @ expected, atol=1e-9 * np.ptp(value))
+    assert found.left_out == ()
+
+
+def test_the_uncertainty_is_the_scatter():
+    """White noise: 40 draws tell a standard deviation to 11 %, 37 terms together to 2 %."""
+    off = []
+    for seed in range(40):
+        x, y, rng = scattered(20_000, seed)
+        found = fit_zernikes(x, y, rng.normal(0, 1e-8, len(x)), TERMS, DISC)
+        off.append(found.coefficients / found.uncertainty)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.06)
+
+
+def test_errors_that_hang_together_count_as_such():
+    """Noise that lasts for 40 points averages out over a fortieth as many."""
+    off = []
+    for seed in range(15):
+        x, y, rng = scattered(40_000, seed)
+        # Points in the order of a path, for it is time in which errors hang together.
+        order = np.argsort(np.hypot(x, y))
+        slow = np.convolve(rng.normal(0, 1e-8, len(x) + 39), np.ones(40) / np.sqrt(40), "valid")
+        found = fit_zernikes(x[order], y[order], slow, TERMS[:9], DISC)
+        off.append(found.coefficients / found.uncertainty)
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_terms_that_the_points_do_not_tell_apart_are_left_out():
+    x, y, _ = scattered()
+    strip = np.abs(y - DISC.y) < 2e-4
+    found = fit_zernikes(x[strip], y[strip], 1e-3 * x[strip], TERMS, DISC)
+    assert 0 < len(found.terms) < 37
+    assert len(found.terms) + len(found.left_out) == 37
+    np.testing.assert_allclose(found.height(x[strip], y[strip]), 1e-3 * x[strip], atol=1e-12)
+
+
+def test_coefficients_of_effects_are_those_of_the_same_fit():
+    x, y, rng = scattered(3000)
+    value, effect = rng.normal(0, 1e-8, (2, len(x)))
+    both = fit_zernikes(x, y, value, TERMS, DISC, effects=effect[np.newaxis])
+    alone = fit_zernikes(x, y, effect, TERMS, DISC)
+    np.testing.assert_allclose(both.effects[:, 0], alone.coefficients, rtol=1e-9)
+    quiet = fit_zernikes(x, y, value, TERMS, DISC)
+    more = both.uncertainty**2 - quiet.uncertainty**2
+    np.testing.assert_allclose(more, alone.coefficients**2, rtol=1e-6, atol=1e-24)
+
+
+def test_too_few_points_are_refused():
+    with pytest.raises(DataError, match="50 points for 37 Zernike terms, expected 74"):
+        fit_zernikes(*np.random.default_rng(0).uniform(-1e-3, 1e-3, (3, 50)), TERMS, DISC)

@@ -1,0 +1,130 @@
+"""From a cloud on disk to what ``form.json`` says."""
+
+import json
+
+import numpy as np
+import pytest
+
+from omsm_ros.cli.main import main
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.surface.freeforms import ZernikeSurface
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.storage.cloud_file import PlyWriter
+from omsm_ros.storage.files import CLOUD
+from omsm_ros.twin.part_pose import PartPose, posed
+
+RADIUS, POINTS = 12.7e-3, 40_000
+ASTIGMATISM, COMA = 50e-9, 15e-9
+
+
+class Mirror:
+    """The paper's mirror with 50 nm of astigmatism and 15 nm of coma at the rim."""
+
+    error = ZernikeSurface(RADIUS, (0, 0, 0, 0, 0, ASTIGMATISM, 0, COMA))
+
+    def height(self, x, y):
+        return PAPER_MIRROR.height(x, y) + self.error.height(x, y)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A cloud with tip, tilt and piston of the part, noise of 10 nm, and dust."""
+    folder = tmp_path_factory.mktemp("form")
+    rng = np.random.default_rng(3)
+    r, angle = np.linspace(RADIUS, 0, POINTS), np.linspace(0, 160 * np.pi, POINTS)
+    x, y = (np.float64(np.float32(v)) for v in (r * np.cos(angle), r * np.sin(angle)))
+    pose = PartPose(z_m=1e-4, tilt_x_rad=2e-3, tilt_y_rad=-1e-3)
+    height = posed(Mirror(), pose).height(x, y) + rng.normal(0, 1e-8, POINTS)
+    dust = rng.random(POINTS) < 1e-3
+    nothing = np.zeros(POINTS)
+    points = SurfacePoints(
+        sample=np.arange(POINTS), x=x, y=y, height=height + 5e-6 * dust, dynamic_error=nothing,
+        uncertainty=nothing, intensity=nothing.astype(np.float32),
+    )  # fmt: skip
+    with PlyWriter(folder / CLOUD) as cloud:
+        cloud.write(points)
+    (folder / "mirror.yaml").write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    (folder / "sphere.yaml").write_text("shape: sphere\nradius: 0.1\n")
+    (folder / "dust").write_text(str(int(dust.sum())))
+    return folder
+
+
+def form(folder, out, *arguments):
+    words = ["form", folder, "--nominal", folder / "mirror.yaml", "--out", out, *arguments]
+    status = main([str(word) for word in words])
+    return status, out / "form.json"
+
+
+def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
+    status, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
+    assert status == 0
+    found = json.loads(path.read_text())
+    assert set(found) == {"pose", "deviation", "zernike", "removed", "aperture", "points"}
+    terms = {(t["n"], t["m"]): t for t in found["zernike"]}
+    assert len(terms) == 37
+    # As heights along z; the deviation is along the normal.
+    known = {(2, -2): ASTIGMATISM, (3, -1): COMA}
+    for name, term in terms.items():
+        off = abs(term["value"] - known.get(name, 0.0))
+        assert off < 4 * term["uncertainty"] + 0.003 * known.get(name, 0.0)
+        assert 1e-11 < term["uncertainty"] < 1e-9
+    for name, value in {"piston": 1e-4, "tip": 2e-3, "tilt": -1e-3}.items():
+        entry = found["pose"][name]
+        assert abs(entry["value"] - value) < 3 * entry["uncertainty"]
+    assert found["pose"]["x"] == {"value": 0.0, "uncertainty": None}
+    points = found["points"]
+    assert points["read"] == POINTS == sum(points.values()) - points["read"]
+    assert points["outliers"] == pytest.approx(int((folder / "dust").read_text()), abs=2)
+    figures = found["deviation"]
+    true_rms = np.hypot(ASTIGMATISM / np.sqrt(6), COMA / np.sqrt(8))
+    rms = figures["rms_without_noise"]
+    # Along z; the normal leans by up to 1.5 % at the rim.
+    assert abs(rms["value"] - true_rms) < 3 * rms["uncertainty"] + 0.012 * true_rms
+    assert figures["point_noise"]["value"] == pytest.approx(1e-8, rel=0.05)
+    assert figures["rms_before_fit"]["value"] > 5e-6
+
+
+def test_with_a_free_pose_terms_carry_what_the_pose_may_have_taken(folder, tmp_path):
+    _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
+    found = json.loads(path.read_text())
+    assert found["removed"]["fitted"] == ["piston", "tip", "tilt", "x", "y"]
+    assert "tip and y" in found["removed"]["not_determined"]["clocking"]
+    for term in found["zernike"]:
+        known = {(2, -2): ASTIGMATISM, (3, -1): COMA}.get((term["n"], term["m"]), 0.0)
+        assert abs(term["value"] - known) < 4 * term["uncertainty"] + 0.003 * known
+    entry = found["pose"]["clocking"]
+    assert entry["uncertainty"] == pytest.approx(np.pi / 180)
+
+
+def test_people_read_the_figures_too(folder, tmp_path, capsys):
+    form(folder, tmp_path, "--fit", "piston,tip,tilt")
+    said = capsys.readouterr().out
+    assert "rms without noise" in said
+    assert "not evaluated" in said
+    assert f"{POINTS} read" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--fit", "roll"], "roll"),
+        (["--fit", "piston,clocking", "--nominal", "{}/sphere.yaml"], "clocking cannot be fitted"),
+        (["--aperture", "1,2"], "expected R or R,X,Y"),
+        (["--aperture", "-1"], "expected R or R,X,Y"),
+        (["--aperture", "0.001,0.05,0"], "0 points lie on"),
+        (["--nominal", "{}/dust"], "dust"),
+    ],
+)
+def test_bad_input_ends_in_one_line(folder, tmp_path, capsys, arguments, named):
+    status, path = form(folder, tmp_path / "out", *(a.format(folder) for a in arguments))
+    assert status == 2
+    assert named in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_a_folder_without_a_cloud_is_named(tmp_path, folder, capsys):
+    nominal = str(folder / "mirror.yaml")
+    assert main(["form", str(tmp_path), "--nominal", nominal, "--out", str(tmp_path / "o")]) == 2
+    assert "no cloud at" in capsys.readouterr().err

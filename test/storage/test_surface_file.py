@@ -1,0 +1,78 @@
+"""Every shape through its YAML; what is wrong in it is named."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.surface.aspheres import Asphere
+from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, SHAPES
+from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
+from omsm_ros.errors import SurfaceError
+from omsm_ros.storage.surface_file import load_surface
+
+TEXTS = {
+    "shape: asphere\nradius: 0.05\nconic_constant: -1\neven_terms: [0, 2.5e3]\n": Asphere(
+        0.05, -1.0, (0.0, 2500.0)
+    ),
+    "shape: zernike\nradius: 0.01\nindexing: noll\nnorm: rms\ncoefficients: [0, 1e-6]\n": (
+        ZernikeSurface(0.01, (0.0, 1e-6), "noll", "rms")
+    ),
+    "shape: xy_polynomial\nradius: 0.01\nterms:\n- {x: 2, y: 1, value: 1.0e-6}\n": XYPolynomial(
+        0.01, (XYTerm(2, 1, 1e-6),)
+    ),
+    "shape: off_axis_section\ndistance: 0.03\nparent: {shape: asphere, radius: 0.1}\n": (
+        OffAxisSection(Asphere(0.1), 0.03)
+    ),
+    "shape: sum\nparts:\n- {shape: asphere, radius: 0.1}\n- {shape: asphere, odd_terms: [1]}\n": (
+        Sum((Asphere(0.1), Asphere(odd_terms=(1.0,))))
+    ),
+    "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    "pose: {x: 1.0e-3, clocking: 0.1}\n": PosedSurface(PAPER_MIRROR, Pose(x=1e-3, clocking=0.1)),
+}
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_description_is_the_surface(text, tmp_path):
+    path = tmp_path / "surface.yaml"
+    path.write_text(text)
+    assert load_surface(path) == TEXTS[text]
+    assert np.isfinite(load_surface(path).height(np.zeros(1), np.zeros(1)))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("radius: 1\n", "shape is required"),
+        ("shape: cone\n", "cone.*expected one of"),
+        ("shape: [sphere]\n", "shape is"),
+        ("shape: sphere\nradius: yes please\n", "radius is 'yes please', expected a number"),
+        ("shape: sphere\nradius: true\n", "radius is True, expected a number"),
+        ("shape: asphere\neven_terms: 3\n", "even_terms is 3, expected a list"),
+        ("shape: asphere\neven_terms: [1, a]\n", r"even_terms\[1\] is 'a', expected a number"),
+        ("shape: zernike\nradius: 1\ncoefficients: []\nindexing: x\n", "expected one of"),
+        ("shape: xy_polynomial\nradius: 1\nterms: [3]\n", r"terms\[0\] is 3, expected names"),
+        ("shape: xy_polynomial\nradius: 1\nterms: [{x: 1, y: 0}]\n", "value is required"),
+        ("shape: xy_polynomial\nradius: 1\nterms: [{x: 1.5, y: 0, value: 1}]\n", "x is 1.5"),
+        ("shape: off_axis_section\ndistance: 1\nparent: 3\n", "parent is 3, expected names"),
+        ("shape: sum\nparts: [{shape: sphere}]\n", r"parts\[0\]: sphere: radius is required"),
+        ("shape: flat\npose: {z: 1}\n", "'z' is unknown"),
+        ("shape: flat\npose: 3\n", "pose is 3, expected names"),
+        ("shape: flat\npose: {tip: 90}\n", "tip is 90.0 rad"),
+        ("shape: off_axis_section\ndistance: 1\nparent: {shape: flat}\n_centre: 1\n", "_centre"),
+    ],
+)
+def test_what_is_wrong_is_named(text, named, tmp_path):
+    path = tmp_path / "surface.yaml"
+    path.write_text(text)
+    with pytest.raises(SurfaceError, match=named):
+        load_surface(path)
+
+
+def test_every_shape_has_a_schema():
+    """A record whose fields the reader does not understand would be found by a user."""
+    from omsm_ros.storage import surface_file
+
+    for name, kind in SHAPES.items():
+        with pytest.raises(SurfaceError, match="no_such"):
+            surface_file.surface_of({"shape": name, "no_such": 1}, "it")
+        assert kind.__doc__
