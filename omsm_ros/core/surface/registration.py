@@ -9,7 +9,7 @@ grow with the scan. Beside the pose the fit allows for the part's own form error
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.form_model import FORM_TERMS, Estimate, estimate, form_columns
 from omsm_ros.core.surface.freedoms import Freedoms, determined, widest
+from omsm_ros.core.surface.normal_equations import NormalEquations
 from omsm_ros.core.surface.placement import (
     FREEDOMS,
     Aperture,
@@ -41,8 +42,6 @@ _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 OUTLIER_SIGMAS = 5.0
 _SIGMA_OF_MAD = 1.4826
 _LEAST_LIMIT_M = 1e-12
-# Consecutive points whose errors may hang together.
-GROUP = 128
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,33 +86,6 @@ class Registration:
         """Return which points (n,) are no outliers."""
         smooth = self.form @ form_columns(*self.disc.scaled(points.x, points.y))
         return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
-
-
-@dataclass(eq=False)
-class _Sums:
-    """Sums of products over the points: columns [−J, Z], deviation, systematic effects."""
-
-    columns: int
-    sources: int
-    points: int = 0
-    square: float = 0.0
-    gram: FloatArray = field(init=False)
-    scores: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.gram = np.zeros((self.columns, self.columns + 1 + self.sources))
-        self.scores = np.zeros(self.columns)
-
-    def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
-            residual: FloatArray) -> None:  # fmt: skip
-        """Take in the next points: columns (q, n), the others (n,), (s, n), (n,)."""
-        right = np.concatenate([columns, deviation[np.newaxis], systematic])
-        self.gram += columns @ right.T
-        self.points += len(deviation)
-        self.square += float(residual @ residual)
-        edges = np.arange(0, len(residual), GROUP)
-        if len(edges):
-            self.scores += np.sum(np.add.reduceat(columns * residual, edges, axis=1) ** 2, axis=1)
 
 
 def register(
@@ -229,8 +201,8 @@ class _Fit:
     def names(self) -> tuple[str, ...]:
         return self.freedoms.fitted
 
-    def new_sums(self, sources: int) -> _Sums:
-        return _Sums(len(self.names) + len(FORM_TERMS), sources)
+    def new_sums(self, sources: int) -> NormalEquations:
+        return NormalEquations(len(self.names) + len(FORM_TERMS), sources)
 
     def unknown(self, at: Placement, chosen: Portion) -> dict[str, FloatArray]:
         """Return what each freedom that the surface does not determine does to the others (2, p).
@@ -256,7 +228,7 @@ class _Fit:
         return found
 
     def sums(
-        self, at: Placement, portion: Portion, form: FloatArray, limit: float, sums: _Sums
+        self, at: Placement, portion: Portion, form: FloatArray, limit: float, sums: NormalEquations
     ) -> FloatArray:
         """Add a portion's points to ``sums``; return their distances from the smooth form."""
         residuals = []
@@ -276,7 +248,7 @@ class _Fit:
             sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
         return np.concatenate(residuals)
 
-    def solved(self, sums: _Sums) -> tuple[Estimate, float]:
+    def solved(self, sums: NormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
         free = len(self.names)
         variance = sums.square / max(sums.points - sums.columns, 1)
