@@ -65,7 +65,9 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     # The figure error of the twin's mirror is a few nanometres here, the probe's noise 10 nm.
     assert summary["deviation"]["corrected"]["rms"] < 15e-9
     assert "<html" in (tmp_path / "report.html").read_text()
-    assert {p.name for p in tmp_path.iterdir()} == {"cloud.ply", "summary.json", "report.html"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        *("cloud.ply", "summary.json", "report.html", "systematic.npz"),
+    }
 
 
 def test_inspect_counts_what_is_there(capsys, folder):
