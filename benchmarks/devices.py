@@ -15,7 +15,7 @@ from benchmarks.row import Row, at_least, at_most
 from omsm_ros.devices.factory import defaults, make_device
 from omsm_ros.emulators.chrocodile import ChrocodileEmulator
 from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
-from omsm_ros.emulators.players import line_for
+from omsm_ros.emulators.players import emulated, line_for
 from omsm_ros.errors import DeviceError
 from omsm_ros.protocols.chrocodile_decoder import BinaryDecoder
 from omsm_ros.protocols.chrocodile_packet import DataFormat, encode_data, encode_format
@@ -91,7 +91,8 @@ def read(name: str, link: str, period: float, seconds: float) -> dict[str, float
     values = {"device": name, "port": told.get(timeout=30.0), "sample_period": period}
     values |= {"block_size": max(100, round(0.01 / period)), "encoders": "XYZUV"}
     values |= {"signals": " ".join(map(str, SIGNALS))}
-    device = make_device(defaults() | values)
+    scales = {k: v for k, v in emulated(name).driver.items() if k.endswith("counts_per_unit")}
+    device = make_device(defaults() | scales | values)
     device.open()
     start, used = time.monotonic(), time.process_time()
     delivered = 0

@@ -65,7 +65,7 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
 
     from omsm_ros.nodes.cell_demo_node import DemoNode
     from omsm_ros.nodes.processes import NodeProcesses
-    from omsm_ros.nodes.running import SAMPLES_QOS
+    from omsm_ros.nodes.topics import SAMPLES_QOS
 
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)

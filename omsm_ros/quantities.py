@@ -204,3 +204,22 @@ TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")
 HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
 SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")
+
+# ------------------------------------------------------------------------------- devices
+
+BAUD_RATE = Quantity("baud rate", "bit/s", 50, 50_000_000, "as the device has it", whole=True)
+TCP_PORT = Quantity("TCP port", "", 0, 65535, "0 = none", whole=True)
+BLOCK_SAMPLES = Quantity("samples in a block", "", 1, 4_000_000, "100 serve most", whole=True)
+COUNTS_PER_UNIT = Quantity(
+    "counts per metre or radian", "", 1e-3, 1e15, "see the encoder's data sheet; sign turns it"
+)
+OFFSET = Quantity("offset", "m or rad", -1e9, 1e9, "give it in metres or radians")
+WRAP = Quantity("counts at which an encoder wraps", "", 0, 2**62, "0 = as the device", whole=True)
+FULL_SCALE = Quantity("measuring range", "m", 1e-9, 10.0, "give it in metres")
+INTENSITY = Quantity("full intensity", "", 1e-9, 1e9, "give the device's own reading")
+PROBABILITY = Quantity("probability", "", 0.0, 1.0, "give a share between 0 and 1")
+PERCENT = Quantity("brightness", "%", 0.0, 100.0, "give it in per cent")
+AVERAGING = Quantity("samples averaged", "", 0, 1_000_000, "as the device can", whole=True)
+THRESHOLD = Quantity("threshold", "", 0.0, 1e9, "as the device states it")
+SENSOR_HEAD = Quantity("sensor head", "", 0, 15, "count from 0", whole=True)
+CHANNEL = Quantity("channel", "", 1, 64, "count from 1", whole=True)

@@ -18,6 +18,7 @@ LAYERS = [
     {"report", "storage", "devices", "emulators"},
     {"twin", "protocols"},
     {"core"},
+    {"parameters"},
     {"quantities"},
     {"errors", "units", "readable", "least_squares", "scipy_parts"},
 ]
@@ -53,6 +54,9 @@ ONLY_IN = {
     "diagnostic_msgs": {"nodes"},
     "builtin_interfaces": {"nodes", "storage.conversions"},
     "rcl_interfaces": {"nodes"},
+    "lifecycle_msgs": {"nodes"},
+    "tf2_msgs": {"nodes"},
+    "geometry_msgs": {"nodes"},
     "serial": {"devices.transport"},
     "socket": {"devices.transport", "emulators.tcp_server"},
     "rosbags": {"storage"},

@@ -1,16 +1,13 @@
 """The shipped YAML files name exactly the parameters that the nodes declare."""
 
-import ast
+import importlib
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
 
 import omsm_ros
-from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.devices import factory
 from omsm_ros.storage.surface_file import load_surface
 
@@ -24,36 +21,51 @@ TABLES = {
     "axis_driver": factory.AXIS_PARAMETERS,
     "reference_driver": factory.REFERENCE_PARAMETERS,
 }
+FRAMES = {
+    "confocal_driver": ["machine_frame", "probe_frame"],
+    "axis_driver": ["machine_frame"],
+    "reference_driver": ["probe_frame"],
+}
+
+
+def _parameters(node):
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    module = importlib.import_module(f"omsm_ros.nodes.{node}_node")
+    return TABLES.get(node) or getattr(module, "PARAMETERS", ())
 
 
 def _declared(node):
-    yield from (entry.name for entry in TABLES.get(node, ()))
-    tree = ast.parse((ROOT / "omsm_ros" / "nodes" / f"{node}_node.py").read_text())
-    for call in ast.walk(tree):
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "parameter":
-            name = call.args[1]
-            if isinstance(name, ast.Constant):
-                yield name.value
-            elif isinstance(name.values[0], ast.Constant):  # f"geometry.{name}"
-                group = {"geometry.": Geometry, "sources.": ErrorSources}[name.values[0].value]
-                yield from (f"{name.values[0].value}{field.name}" for field in fields(group))
-            else:  # f"{axis}.counts_per_unit"
-                yield from (f"{axis}{name.values[1].value}" for axis in "xyzbc")
+    """Names of what a managed node can be set to."""
+    names = [parameter.name for parameter in _parameters(node)]
+    return [*names, "autostart", *FRAMES.get(node, [])] if names else []
 
 
-def _flat(values, prefix=""):
+def _flat_items(values, prefix=""):
     for key, value in values.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from _flat_items(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}"
+            yield f"{prefix}{key}", value
+
+
+def _flat(values):
+    return [name for name, _ in _flat_items(values)]
 
 
 @pytest.mark.parametrize("node", NODES)
 def test_every_parameter_stands_in_the_yaml(node):
     ((key, content),) = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text()).items()
-    assert key == f"/omsm/{node}"
+    assert key == "/**"  # in whatever namespace, under whatever name
     assert sorted(_flat(content["ros__parameters"])) == sorted(_declared(node))
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_every_value_of_the_yaml_will_do(node):
+    """Ranges and types: what is shipped must not be refused; what must be given is given."""
+    content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text())["/**"]
+    values = dict(_flat_items(content["ros__parameters"]))
+    for parameter in _parameters(node):
+        parameter.checked(values[parameter.name])
 
 
 def test_every_node_with_parameters_has_its_yaml():

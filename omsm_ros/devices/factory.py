@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from omsm_ros import quantities
 from omsm_ros.devices.capancdt import CapaNcdtDevice, CapaNcdtSettings
-from omsm_ros.devices.chrocodile import ChrocodileSettings
+from omsm_ros.devices.chrocodile import FORMATS, TRIGGERS, ChrocodileSettings
 from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
 from omsm_ros.devices.chrocodile_packet import ChrocodilePacketDevice
 from omsm_ros.devices.confocaldt import (
@@ -24,7 +25,8 @@ from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.trace import TracedTransport
 from omsm_ros.devices.transport import DEFAULT_BAUD_RATE, Transport, transport_for
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.protocols.chrocodile_readings import ProbeReading
+from omsm_ros.parameters import Parameter
+from omsm_ros.protocols.chrocodile_readings import LATCHES, ProbeReading
 from omsm_ros.protocols.csv_stream import COLUMNS
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling, ProbeScaling, StreamScaling
 
@@ -32,76 +34,116 @@ Values: TypeAlias = Mapping[str, Any]
 NowNs: TypeAlias = Callable[[], int]
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One thing that can be set; the same names in ROS, YAML and here."""
-
-    name: str
-    default: bool | int | float | str
-    description: str
-
-
 _USUAL = StreamScaling()
+_SIGNS = (1, -1)
+_AS_IT_IS = "as the device has it"
+_PERIOD = "of the trigger, or of a device that runs freely [s]"
+_STREAMS = ("six_channel", "six_channel_text")
+_CHROCODILES = ("chrocodile", "chrocodile_packet")
+_CONFOCALDTS = ("confocaldt", "confocaldt_ethernet")
+_COMMAND_PORT = Parameter(
+    "command_port",
+    0,
+    "TCP port for commands (confocalDT, capaNCDT: 23); 0 = leave it as it is set",
+    quantities.TCP_PORT,
+)
+
+
+def _axis_parameters(axis: str, unit: str) -> tuple[Parameter, ...]:
+    # A scale that nobody stated would still give plausible positions, so there is none.
+    return (
+        Parameter(
+            f"{axis}.counts_per_unit",
+            0.0,
+            f"counts per {unit}; 0 = not stated, refused for an axis that is read",
+            quantities.COUNTS_PER_UNIT,
+            unset=0.0,
+        ),
+        Parameter(f"{axis}.sign", 1, "+1 or -1", choices=_SIGNS),
+        Parameter(f"{axis}.offset", 0.0, f"position at zero counts [{unit}]", quantities.OFFSET),
+        Parameter(f"{axis}.wrap", 0, "counts; 0 = as the device", quantities.WRAP),
+    )
+
+
+def _probe_parameters(full_scale: float) -> tuple[Parameter, ...]:
+    return (
+        Parameter("probe.full_scale", full_scale, "measuring range [m]", quantities.FULL_SCALE),
+        Parameter("probe.polarity", 1, "+1: falls as z rises; -1: reversed", choices=_SIGNS),
+        Parameter("probe.zero", 0.0, "reading that is distance zero [m]", quantities.DISTANCE),
+    )
+
+
+_BLOCK_PARAMETERS = (
+    Parameter("sample_period", 1e-3, _PERIOD, quantities.SAMPLE_PERIOD),
+    Parameter("block_size", 100, "samples in a message", quantities.BLOCK_SAMPLES),
+)
+_PORT = Parameter(
+    "port", "", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, or a path", required=True
+)
+_DEVICE = Parameter(
+    "device",
+    "six_channel",
+    "what is connected: see docs/devices.md",
+    choices=(*_STREAMS, *_CHROCODILES, *_CONFOCALDTS),
+)
+_STREAM_PARAMETERS = (
+    _PORT,
+    Parameter(
+        "baud_rate",
+        DEFAULT_BAUD_RATE,
+        "of a serial port that does not name its own",
+        quantities.BAUD_RATE,
+    ),
+    *_BLOCK_PARAMETERS,
+    *(p for axis in AXES for p in _axis_parameters(axis, "rad" if axis in "bc" else "m")),
+)
+_COLUMNS = "of a line of text, in order; - = one to pass over"
 
 PARAMETERS = (
-    Parameter("device", "six_channel", "what is connected: see the table of devices"),
-    Parameter("port", "/tmp/omsm_cell", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, path"),
-    Parameter("baud_rate", DEFAULT_BAUD_RATE, "of a serial port that does not name its own"),
+    _DEVICE,
+    *_STREAM_PARAMETERS,
     Parameter("trace", "", "file for a trace of the wire; empty = none"),
-    Parameter("sample_period", 1e-3, "of the trigger, or of a device that runs freely [s]"),
-    Parameter("block_size", 100, "samples in a message"),
-    *(
-        parameter
-        for name, axis in zip(AXES, _USUAL.axes, strict=True)
-        for parameter in (
-            Parameter(f"{name}.counts_per_unit", axis.counts_per_unit, "counts per m or rad"),
-            Parameter(f"{name}.sign", axis.sign, "+1 or -1"),
-            Parameter(f"{name}.offset", axis.offset, "position at zero counts [m, rad]"),
-            Parameter(f"{name}.wrap", axis.wrap, "counts at which it wraps; 0 = as the device"),
-        )
+    Parameter("columns", " ".join(COLUMNS), _COLUMNS),
+    *_probe_parameters(_USUAL.probe.full_scale),
+    Parameter(
+        "probe.intensity_full_scale", 100.0, "reading that is intensity 1", quantities.INTENSITY
     ),
-    Parameter("columns", " ".join(COLUMNS), "of a line of text; - = one to pass over"),
-    Parameter("probe.full_scale", _USUAL.probe.full_scale, "measuring range [m]"),
-    Parameter("probe.polarity", _USUAL.probe.polarity, "+1: falls as z rises; -1: reversed"),
-    Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
-    Parameter("probe.intensity_full_scale", 100.0, "reading that is intensity 1"),
     Parameter(
         "encoders",
         "",
         "CHRocodile: its inputs on X Y Z B C, e.g. XYZUV; confocalDT: the axes on "
         "its encoders 1 2 3, e.g. XZC; empty = none wired",
     ),
-    Parameter("latch", "start", "of its encoders at the exposure's start, end, or their mean"),
-    Parameter("trigger", "free_run", "free_run, each, once or window"),
-    Parameter("format", "binary", "of the telegrams: binary or ascii"),
+    Parameter(
+        "latch", "start", "encoders at the exposure's start, end, or mean", choices=tuple(LATCHES)
+    ),
+    Parameter("trigger", "free_run", "what starts a sample", choices=tuple(TRIGGERS)),
+    Parameter("format", "binary", "of the telegrams", choices=tuple(FORMATS)),
     Parameter("signals", "", "CHRocodile: for $SODX; confocalDT RS-422: of a frame, in order"),
-    Parameter("command_port", 0, "TCP port for commands (confocalDT: 23); 0 = leave it as set"),
-    Parameter("lamp", -1.0, "brightness 0-100; negative = as the device has it"),
-    Parameter("averaging", -1, "samples; negative = as the device has it"),
-    Parameter("threshold", -1.0, "of detection; negative = as the device has it"),
-    Parameter("sensor_head", -1, "0-15; negative = as the device has it"),
+    _COMMAND_PORT,
+    Parameter("lamp", -1.0, f"brightness [%]; -1 = {_AS_IT_IS}", quantities.PERCENT, unset=-1.0),
+    Parameter("averaging", -1, f"samples; -1 = {_AS_IT_IS}", quantities.AVERAGING, unset=-1),
+    Parameter(
+        "threshold", -1.0, f"of detection; -1 = {_AS_IT_IS}", quantities.THRESHOLD, unset=-1.0
+    ),
+    Parameter("sensor_head", -1, f"-1 = {_AS_IT_IS}", quantities.SENSOR_HEAD, unset=-1),
 )
 
-
 # Axes alone: the same streams, whose distance, if they have one, is left out.
-_AXIS_NAMES = ("device", "port", "baud_rate", "sample_period", "block_size", "columns")
-AXIS_PARAMETERS = tuple(
-    parameter
-    for parameter in PARAMETERS
-    if parameter.name in _AXIS_NAMES or parameter.name[:2] in ("x.", "y.", "z.", "b.", "c.")
+AXIS_PARAMETERS = (
+    replace(_DEVICE, choices=_STREAMS),
+    *_STREAM_PARAMETERS,
+    Parameter("columns", " ".join(COLUMNS), _COLUMNS),
 )
 
 REFERENCE_PARAMETERS = (
-    Parameter("device", "capancdt", "what is connected: see the table of devices"),
-    Parameter("port", "tcp://169.254.168.150:10001", "tcp://host:port of the measured values"),
-    Parameter("command_port", 0, "TCP port for commands (capaNCDT: 23); 0 = leave it as set"),
-    Parameter("sample_period", 1e-3, "of the controller, or of its trigger [s]"),
-    Parameter("block_size", 100, "samples in a message"),
-    Parameter("channel", 1, "of the controller, from 1"),
+    replace(_DEVICE, default="capancdt", choices=("capancdt",)),
+    _PORT,
+    _COMMAND_PORT,
+    *_BLOCK_PARAMETERS,
+    Parameter("channel", 1, "of the controller", quantities.CHANNEL),
     Parameter("triggered", False, "samples come with a trigger from outside"),
-    Parameter("probe.full_scale", 250e-6, "measuring range of the channel [m]"),
-    Parameter("probe.polarity", 1, "+1: falls as z rises; -1: reversed"),
-    Parameter("probe.zero", 0.0, "reading that is distance zero [m]"),
+    *_probe_parameters(250e-6),
 )
 
 
@@ -129,9 +171,8 @@ def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
 
     values: every name of AXIS_PARAMETERS. Raises ConfigurationError.
     """
-    streams = ("six_channel", "six_channel_text")
-    if values["device"] not in streams:
-        raise ConfigurationError(f"device {values['device']!r}, expected one of {streams}")
+    if values["device"] not in _STREAMS:
+        raise ConfigurationError(f"device {values['device']!r}, expected one of {_STREAMS}")
     return make_device(defaults() | dict(values), now_ns)
 
 
@@ -154,10 +195,20 @@ def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice
     return CapaNcdtDevice(transport_for(values["port"]), settings, now_ns, commands=commands)
 
 
-def _axes(values: Values) -> dict[str, AxisScaling]:
+def _axes(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScaling]:
+    """The scaling of every axis; ConfigurationError for one of ``wired`` without a scale."""
+    for axis in wired:
+        if values[f"{axis}.counts_per_unit"] == 0:
+            raise ConfigurationError(
+                f"parameter '{axis}.counts_per_unit' is not stated, and axis {axis} is read: give "
+                "the encoder's counts per metre or radian (config/ has a YAML to copy)"
+            )
+    given = {
+        axis: {f.name: values[f"{axis}.{f.name}"] for f in fields(AxisScaling)} for axis in AXES
+    }
     return {
-        axis: AxisScaling(**{f.name: values[f"{axis}.{f.name}"] for f in fields(AxisScaling)})
-        for axis in AXES
+        axis: AxisScaling(**(each if axis in wired else each | {"counts_per_unit": 1.0}))
+        for axis, each in given.items()
     }
 
 
@@ -174,8 +225,8 @@ def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamD
 
 def _six_channel_text(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
     probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
-    scaling = StreamScaling(**_axes(values), probe=probe)
     columns = tuple(values["columns"].replace(",", " ").split())
+    scaling = StreamScaling(**_axes(values, [a for a in AXES if a in columns]), probe=probe)
     settings = CsvSettings(**_blocks(values), columns=columns, scaling=scaling)
     return CsvStreamDevice(transport, settings, now_ns)
 
@@ -215,7 +266,9 @@ def _confocaldt_ethernet(values: Values, transport: Transport, now_ns: NowNs) ->
     settings = ConfocalDtSettings(
         **_blocks(values),
         probe=_probe_reading(values),
-        axes=tuple(_axes(values).values()) if values["encoders"] else None,
+        axes=tuple(_axes(values, values["encoders"].lower()).values())
+        if values["encoders"]
+        else None,
         wired=_wired(values["encoders"]),
         trigger=values["trigger"],
     )

@@ -18,7 +18,7 @@ from omsm_ros.emulators.sources import RecordingSource
 from omsm_ros.emulators.tcp_server import TcpServer
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
-from omsm_ros.protocols.generic_stream import AXES
+from omsm_ros.protocols.generic_stream import AXES, StreamScaling
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.units import MICROMETRE_M
 
@@ -154,6 +154,10 @@ def _csv(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(CsvStreamEmulator(line, triggered=True, seed=faults.seed))
 
 
+_STREAM_SCALES: dict[str, object] = {
+    f"{name}.counts_per_unit": axis.counts_per_unit
+    for name, axis in zip(AXES, StreamScaling().axes, strict=True)
+}
 _OWN_ENCODERS: dict[str, object] = {
     "encoders": "XYZUV",
     "trigger": "each",
@@ -164,8 +168,8 @@ _OWN_ENCODERS: dict[str, object] = {
 }
 
 EMULATED = {
-    "six_channel": Emulated(StreamPlayer, {}),
-    "six_channel_text": Emulated(_csv, {}),
+    "six_channel": Emulated(StreamPlayer, _STREAM_SCALES),
+    "six_channel_text": Emulated(_csv, _STREAM_SCALES),
     "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
     "chrocodile_packet": Emulated(_chrocodile_packet, _OWN_ENCODERS, tcp=True),
     # Y and B stand still in the twin's motions: three encoders are enough.

@@ -130,6 +130,7 @@ class Demonstration:
             "machine": "digital twin of the paper's cell",
             "fixture": "twin",
             "probe_rate_hz": 1 / self.sample_period,
+            "time_lapse": self.time_lapse,
             "seed": self.seed,
         }
 

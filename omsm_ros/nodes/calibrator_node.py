@@ -2,155 +2,201 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
-from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.srv import Identify
-from rclpy.node import Node
 
+from omsm_ros import quantities
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.identification.identify import Identification, identify
 from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
-from omsm_ros.errors import OmsmError
+from omsm_ros.core.samples.recent import RecentIncrease
+from omsm_ros.core.samples.stamped_period import check_period
+from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.jobs.identify_bag import motion_of_bag
-from omsm_ros.nodes.running import (
-    LATCHED_QOS,
-    NAMESPACE,
-    OK,
-    SAMPLES_QOS,
-    Diagnostics,
-    parameter,
-    run,
-    serve,
-    settings_of,
-)
-from omsm_ros.quantities import BUFFER_SAMPLES, DURATION, ORDER
+from omsm_ros.nodes.aside import Aside
+from omsm_ros.nodes.calibration_topic import CalibrationTopic
+from omsm_ros.nodes.diagnostics import WARN, Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run, settings_of
+from omsm_ros.nodes.topics import MessageInfo, listen
+from omsm_ros.parameters import Parameter
 from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.calibration_folder import CalibrationFolder
+
+PARAMETERS = (
+    Parameter("buffer_samples", 3_600_000, "samples kept per topic", quantities.BUFFER_SAMPLES),
+    Parameter(
+        "output", "calibration.json", "link to the calibration in force; each has a file beside it"
+    ),
+    Parameter("report", "", "folder for the certificate of each identification; empty = none"),
+    Parameter("settings", "{}", "JSON object of what the calibration belongs to"),
+)
+_STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceBlock}
 
 
-class CalibratorNode(Node):
-    """Serves ``~/identify``; writes the calibration to a file and publishes it latched."""
+class CalibratorNode(ManagedNode):
+    """Serves ``~/identify``; keeps every calibration, and tells the one in force."""
 
     def __init__(self) -> None:
-        super().__init__("calibrator", namespace=NAMESPACE)
-        capacity = parameter(
-            self, "buffer_samples", 3_600_000, "samples kept per topic", BUFFER_SAMPLES
-        )
-        self._output = parameter(
-            self, "output", "calibration.json", "where to write the calibration"
-        )
-        self._report_folder = parameter(
-            self, "report", "", "folder for the certificate of each identification; empty = none"
-        )
-        self._settings = settings_of(
-            parameter(self, "settings", "{}", "JSON object of what the calibration belongs to")
-        )
-        self._axes: BlockBuffer = BlockBuffer(capacity)
-        self._distance: BlockBuffer = BlockBuffer(capacity)
-        self._reference: BlockBuffer = BlockBuffer(capacity)
-        self._refused = 0
-        self._last = "nothing identified yet"
+        super().__init__("calibrator", PARAMETERS)
         self._messages = conversions.ros_messages()
-        self._publisher = self.create_publisher(CalibrationMessage, "calibration", LATCHED_QOS)
-        self.create_subscription(AxisBlock, "axes", self._on_axes, SAMPLES_QOS)
-        for topic, buffer in (("confocal", self._distance), ("reference", self._reference)):
-            self.create_subscription(
-                DistanceBlock,
-                topic,
-                lambda message, into=buffer: self._on_distance(message, into),
-                SAMPLES_QOS,
-            )
-        serve(self, Identify, "~/identify", self._on_identify)
-        self._diagnostics = Diagnostics(self, self._report)
 
-    def _on_axes(self, message: AxisBlock) -> None:
-        self._keep(conversions.axis_block, message, self._axes)
+    def configure(self, undo: ExitStack) -> None:
+        """Take up what was in force, and answer requests."""
+        self._settings = settings_of(self.values["settings"])
+        self._folder = CalibrationFolder(Path(self.values["output"]))
+        capacity = self.values["buffer_samples"]
+        self._buffers: dict[str, BlockBuffer[Any]] = {
+            topic: BlockBuffer(capacity) for topic in _STREAMS
+        }
+        self._refused = dict.fromkeys(_STREAMS, 0)
+        self._recent = RecentIncrease()
+        self._last, self._trouble = "nothing identified yet", ""
+        self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
+        self._aside = Aside(self, undo)
+        self._aside.serve(undo, Identify, "~/identify", self._on_identify)
+        self._take_up()
 
-    def _on_distance(self, message: DistanceBlock, buffer: BlockBuffer) -> None:
-        self._keep(conversions.distance_block, message, buffer)
+    def activate(self, undo: ExitStack) -> None:
+        """Begin to keep the motion."""
+        for topic, kind in _STREAMS.items():
+            listen(self, undo, kind, topic, partial(self._keep, topic))
 
-    def _keep(self, convert, message, buffer: BlockBuffer) -> None:  # type: ignore[no-untyped-def]
+    def _keep(self, topic: str, message: AxisBlock | DistanceBlock, _: MessageInfo) -> None:
+        convert = conversions.axis_block if topic == "axes" else conversions.distance_block
         try:
-            buffer.add(convert(message))
+            self._buffers[topic].add(convert(message))
         except OmsmError as err:
-            self._refused += 1
+            self._refused[topic] += 1
             self.get_logger().warning(f"block refused: {err}", throttle_duration_sec=5.0)
 
-    def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
-        self._last = "identification failed, see the log"
+    # ------------------------------------------------------------------- what is in force
+
+    def _take_up(self) -> None:
+        """Tell what was in force before this start."""
         try:
-            identified = self._identify(request)
+            known = self._folder.in_force()
+        except OmsmError as err:
+            self._trouble = str(err)
+            self.get_logger().error(f"calibration in force: {err}")
+            return
+        if known is not None:
+            self._topic.tell(*known)
+            self._last = f"{known[0].id[:12]} in force, as before the start"
+
+    def _adopt(self, calibration: Calibration, since_ns: int) -> None:
+        """Keep what another node put in force; it is told even if it cannot be kept."""
+        verdict, reasons = verdict_of(calibration)
+        if verdict == REJECTED:
+            raise ConfigurationError(f"rejected: {'; '.join(reasons)}")
+        self._keep_file(calibration, since_ns)
+
+    def _keep_file(self, calibration: Calibration, since_ns: int) -> str:
+        try:
+            file = self._folder.put(calibration, since_ns)
+            self._trouble = ""
+        except OmsmError as err:
+            self._trouble = f"the calibration in force is not kept: {err}"
+            self.get_logger().error(self._trouble)
+            return self._trouble
+        return f"kept as {file}"
+
+    # ------------------------------------------------------------------- identification
+
+    async def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
+        try:
+            identified = await self._aside.do(self._work(request))
             calibration = identified.calibration
+            since_ns = self._topic.decided()
             response.calibration = conversions.calibration_message(
-                self._messages, calibration, self.get_clock().now().nanoseconds
+                self._messages, calibration, since_ns
             )
-            response.success, self._last = self._judge(calibration)
-            self._last += self._certified(request, identified)
+            response.success, self._last = self._judge(calibration, since_ns)
+            if self.values["report"]:
+                said = await self._aside.do(partial(self._certified, request.bag, identified))
+                self._last += said
         except OmsmError as err:
             response.success, self._last = False, f"identification failed: {err}"
         if response.success:
-            self._publisher.publish(response.calibration)
             self.get_logger().info(self._last)
         else:
             self.get_logger().error(self._last)
         response.message = self._last
 
-    def _judge(self, calibration: Calibration) -> tuple[bool, str]:
+    def _judge(self, calibration: Calibration, since_ns: int) -> tuple[bool, str]:
         verdict, reasons = verdict_of(calibration)
         if verdict == REJECTED:
             # An earlier, good calibration stays in its file and in use.
             return False, f"rejected: {'; '.join(reasons)}"
-        save_calibration(self._output, calibration)
-        return True, f"{verdict}; {calibration.id[:12]} written to {self._output}"
+        kept = self._keep_file(calibration, since_ns)
+        self._topic.tell(calibration, since_ns)
+        return True, f"{verdict}; {calibration.id[:12]} {kept}"
 
-    def _certified(self, request: Identify.Request, identified: Identification) -> str:
-        """Write the certificate, if wanted, and say so; a full disk does not undo a calibration."""
-        if not self._report_folder:
-            return ""
+    def _certified(self, bag: str, identified: Identification) -> str:
+        """Write the certificate and say so; a full disk does not undo a calibration."""
         # Drawing takes a second to import; most calibrators do without.
         from omsm_ros.jobs.certify import write_certificate
 
+        folder = Path(self.values["report"])
         try:
-            page = write_certificate(
-                Path(self._report_folder),
-                identified,
-                source=Path(request.bag).name or "live recording",
-            )
+            page = write_certificate(folder, identified, source=Path(bag).name or "live recording")
         except OmsmError as err:
             return f"; no certificate: {err}"
         return f"; certificate in {page}"
 
-    def _identify(self, request: Identify.Request) -> Identification:
-        return identify(
-            self._motion(request),
-            order=ORDER.checked(request.order),
-            input=request.input or "encoder",
-            settings=self._settings,
-        )
-
-    def _motion(self, request: Identify.Request) -> MotionRecord:
-        duration = DURATION.checked(request.duration)
+    def _work(self, request: Identify.Request):  # type: ignore[no-untyped-def]
+        """Return what is to be done beside the samples; what it needs of them is taken now."""
+        duration = quantities.DURATION.checked(request.duration)
+        order = quantities.ORDER.checked(request.order)
         if request.bag:
-            return motion_of_bag(Path(request.bag), duration=duration)
-        return assemble(
-            self._axes.recent(duration),
-            self._distance.recent(duration),
-            self._reference.recent(duration),
-        )
+            motion = partial(self._motion_of_bag, Path(request.bag), duration)
+        else:
+            motion = partial(
+                self._live_motion, *(self._buffers[topic].recent(duration) for topic in _STREAMS)
+            )
+        settings, source = self._settings, request.input or "encoder"
+        return lambda: identify(motion(), order=order, input=source, settings=settings)
 
-    def _report(self) -> tuple[bytes, str, dict[str, object]]:
-        values = {
-            "axes_held": len(self._axes),
-            "distance_held": len(self._distance),
-            "reference_held": len(self._reference),
-            "axes_forgotten": self._axes.forgotten,
-            "distance_forgotten": self._distance.forgotten,
-            "blocks_refused": self._refused,
+    def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
+        return motion_of_bag(bag, duration=duration, time_lapse=self._time_lapse)
+
+    def _live_motion(self, *streams: list[Any]) -> MotionRecord:
+        faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
+        if faster == 1.0:  # a time lapse is as even as the computer that plays it
+            for name, blocks in zip(_STREAMS, streams, strict=True):
+                check_period(name, blocks)
+        return assemble(*streams)
+
+    @property
+    def _time_lapse(self) -> object:
+        return self._settings.get("time_lapse", 1.0)
+
+    # ------------------------------------------------------------------- state
+
+    def report(self) -> Report:
+        """Return what is held, in force, and refused."""
+        in_force = self._topic.calibration
+        values: dict[str, object] = {
+            "calibration": in_force.id if in_force else "",
+            "requests_waiting": self._aside.waiting,
+            "blocks_refused": sum(self._refused.values()),
         }
-        return OK, self._last, values
+        for topic, buffer in self._buffers.items():
+            name = "distance" if topic == "confocal" else topic
+            values |= {f"{name}_held": len(buffer), f"{name}_forgotten": buffer.forgotten}
+        report = Report(self._last, values)
+        for topic in self._recent.update(self._refused, time.monotonic()):
+            report.add(WARN, f"blocks on {topic} are refused, see the log")
+        if self._trouble:
+            report.add(WARN, self._trouble)
+        return report
 
 
 def main() -> None:

@@ -2,21 +2,52 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
+from typing import Any
 
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from omsm_ros import quantities
 from omsm_ros.emulators.generic_stream import Faults
-from omsm_ros.emulators.players import emulated, line_for
-from omsm_ros.errors import ConfigurationError, OmsmError
-from omsm_ros.nodes.running import NAMESPACE, OK, Diagnostics, parameter, run
+from omsm_ros.emulators.players import EMULATED, emulated, line_for
+from omsm_ros.nodes.diagnostics import Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run, serve
+from omsm_ros.parameters import Parameter
 from omsm_ros.storage.disturbance_file import load_disturbances
+from omsm_ros.storage.runtime_folder import runtime_folder
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
+_SCENARIO = (
+    Parameter("seed", 1, "seed of all noise", quantities.SEED),
+    Parameter("spindle_speed", 30.0, "[rpm], negative reverses", quantities.SPEED),
+    Parameter("feed_per_turn", 1e-4, "radial feed [m]", quantities.LENGTH),
+    Parameter("start_radius", 12.7e-3, "start of the spiral [m]", quantities.LENGTH),
+    Parameter("step_rise", 20e-3, "edge of the step test [s]; 0 = sharp", quantities.RISE, unset=0),
+    Parameter("sample_period", 1e-3, "of the trigger [s]", quantities.SAMPLE_PERIOD),
+)
+_FAULTS = (
+    Parameter("fault_noise", 0.0, "noise burst before a frame", quantities.PROBABILITY),
+    Parameter("fault_flip", 0.0, "flipped bit in a frame", quantities.PROBABILITY),
+    Parameter("fault_drop", 0.0, "frame lost", quantities.PROBABILITY),
+)
+PARAMETERS = (
+    Parameter(
+        "device", "six_channel", "what to imitate, as in the driver", choices=tuple(EMULATED)
+    ),
+    Parameter(
+        "link", "", "serial port to offer, or tcp://127.0.0.1:PORT; empty = in a private folder"
+    ),
+    Parameter("time_lapse", 1.0, "how much faster than real time to play", quantities.TIME_LAPSE),
+    *_SCENARIO,
+    Parameter("disturbances", "", "file of what is wrong with the machine"),
+    *_FAULTS,
+)
 
-class CellEmulatorNode(Node):
+
+class CellEmulatorNode(ManagedNode):
     """Plays a motion on request; each motion starts the trigger counter anew.
 
     Services: ``~/step_test``, ``~/scan`` (std_srvs/Trigger) answer as soon as the motion has
@@ -24,67 +55,54 @@ class CellEmulatorNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("cell_emulator", namespace=NAMESPACE)
-        link = parameter(
-            self, "link", "/tmp/omsm_cell", "serial port to offer, or tcp://127.0.0.1:PORT"
-        )
-        self._time_lapse = parameter(
-            self, "time_lapse", 1.0, "how much faster than real time to play [1]"
-        )
-        if not self._time_lapse > 0:
-            raise ConfigurationError(f"time_lapse {self._time_lapse!r} must be positive")
-        self._scenario = Scenario(
-            seed=parameter(self, "seed", 1, "seed of all noise"),
-            spindle_speed=parameter(self, "spindle_speed", 30.0, "[rpm], negative reverses"),
-            feed_per_turn=parameter(self, "feed_per_turn", 1e-4, "radial feed [m]"),
-            start_radius=parameter(self, "start_radius", 12.7e-3, "start of the spiral [m]"),
-            step_rise=parameter(self, "step_rise", 20e-3, "edge of the step test [s], 0 = sharp"),
-            sample_period=parameter(self, "sample_period", 1e-3, "of the trigger [s]"),
-        )
-        file = parameter(self, "disturbances", "", "file of what is wrong with the machine")
+        super().__init__("cell_emulator", PARAMETERS)
+        self._link = ""
+
+    def hardware_id(self) -> str:
+        """Return the port."""
+        return self._link
+
+    def configure(self, undo: ExitStack) -> None:
+        """Offer the port, and answer requests."""
+        values = self.values
+        self._scenario = Scenario(**{p.name: values[p.name] for p in _SCENARIO})
+        file = values["disturbances"]
         self._disturbances = load_disturbances(file) if file else NOTHING
         faults = Faults(
-            seed=self._scenario.seed,
-            noise=parameter(self, "fault_noise", 0.0, "noise burst before a frame, probability"),
-            flip=parameter(self, "fault_flip", 0.0, "flipped bit in a frame, probability"),
-            drop=parameter(self, "fault_drop", 0.0, "frame lost, probability"),
+            seed=values["seed"],
+            **{p.name.removeprefix("fault_"): values[p.name] for p in _FAULTS},
         )
-        device = parameter(self, "device", "six_channel", "what to imitate, as in the driver")
-        self._line = line_for(link)
-        self._line.__enter__()
-        self._player = emulated(device).player(self._line, faults)
-        self.create_service(Trigger, "~/step_test", partial(self._start, step_test_of))
-        self.create_service(Trigger, "~/scan", partial(self._start, scan_of))
-        self.create_service(Trigger, "~/stop", self._on_stop)
-        self._diagnostics = Diagnostics(self, self._report, hardware_id=link)
-        self.get_logger().info(f"cell at {link}, time lapse {self._time_lapse:g}")
+        self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
+        line = undo.enter_context(line_for(self._link))
+        self._player = emulated(values["device"]).player(line, faults)
+        undo.callback(self._player.close)
+        for name, motion_of in (("step_test", step_test_of), ("scan", scan_of)):
+            serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
+        serve(self, undo, Trigger, "~/stop", self._on_stop)
+        self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
-    def _start(self, motion_of, request, response):  # type: ignore[no-untyped-def]
-        if self._player.playing:
+    def activate(self, undo: ExitStack) -> None:
+        """Let motions be played."""
+        undo.callback(self._player.halt)
+
+    def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
+        if not self.active:
+            response.success, response.message = False, "inactive; activate it first"
+        elif self._player.playing:
             response.success, response.message = False, "a motion is running; stop it first"
-            return response
-        try:
+        else:
             recording = motion_of(self._scenario, self._disturbances)
-        except OmsmError as err:
-            response.success, response.message = False, str(err)
-            return response
-        self._player.start(recording, self._time_lapse)
-        response.success, response.message = True, f"{len(recording.axes)} samples"
-        return response
+            self._player.start(recording, self.values["time_lapse"])
+            response.success, response.message = True, f"{len(recording.axes)} samples"
 
-    def _on_stop(self, request, response):  # type: ignore[no-untyped-def]
+    def _on_stop(self, request: Any, response: Any) -> None:
         self._player.halt()
         response.success, response.message = True, f"{self._player.played} samples played"
-        return response
 
-    def _report(self) -> tuple[bytes, str, dict[str, object]]:
+    def report(self) -> Report:
+        """Return whether a motion is played."""
         words = "playing" if self._player.playing else "waiting"
-        return OK, words, {"samples_played": self._player.played}
-
-    def close(self) -> None:
-        """End the motion and withdraw the port."""
-        self._player.close()
-        self._line.__exit__(None, None, None)
+        return Report(words, {"samples_played": self._player.played})
 
 
 def main() -> None:

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
-from rclpy.node import Node
+from rclpy.publisher import Publisher
 
+from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.devices.blocks import BlockPair
-from omsm_ros.devices.factory import Parameter
-from omsm_ros.devices.reader import DeviceReader
+from omsm_ros.devices.reader import DeviceReader, State
 from omsm_ros.devices.stream import StreamDevice
-from omsm_ros.nodes.running import ERROR, NAMESPACE, OK, SAMPLES_QOS, WARN, Diagnostics, parameter
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.parameters import Parameter
 from omsm_ros.storage import conversions
 
 _FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown")
+# Shorter pauses are those between two motions of a step test.
+_SILENCE_S = 2.0
+_SILENCE_SAMPLES = 5
+_END_S = 5.0
 
 
-class DriverNode(Node):
+class DriverNode(ManagedNode):
     """Publishes a device's blocks; whatever happens on the wire, the node stays."""
 
     def __init__(
@@ -32,45 +40,81 @@ class DriverNode(Node):
         distance: str | None = None,
     ) -> None:
         """axes, distance: topics of the blocks; None = it has none."""
-        super().__init__(name, namespace=NAMESPACE)
-        values = {p.name: parameter(self, p.name, p.default, p.description) for p in parameters}
+        frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
+        if distance:
+            frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
+        super().__init__(name, (*parameters, *frames))
+        self._make = make
+        self._axes_topic, self._distance_topic = axes, distance
+        self._axes: Publisher | None = None
+        self._distance: Publisher | None = None
         self._messages = conversions.ros_messages()
-        self._axes = self.create_publisher(AxisBlock, axes, SAMPLES_QOS) if axes else None
-        self._distance = (
-            self.create_publisher(DistanceBlock, distance, SAMPLES_QOS) if distance else None
-        )
-        self._topics = {axes: self._axes, distance: self._distance}
-        self._device = make(values, lambda: self.get_clock().now().nanoseconds)
-        self._reader = DeviceReader(self._device, self._publish, self._note)
-        self._stop = threading.Event()
-        self._diagnostics = Diagnostics(self, self._report, hardware_id=values["port"])
-        self._thread = threading.Thread(target=self._reader.run, args=(self._stop,), daemon=True)
-        self._thread.start()
 
-    def _note(self, text: str) -> None:
-        self.get_logger().info(text)
+    def hardware_id(self) -> str:
+        """Return the port."""
+        return str(self.values.get("port", ""))
+
+    def configure(self, undo: ExitStack) -> None:
+        """Make the device, which nobody touches yet."""
+        self._device = self._make(self.values, lambda: self.get_clock().now().nanoseconds)
+        self._reader = DeviceReader(self._device, self._publish, self.get_logger().info)
+        self._recent, self._flow = RecentIncrease(), Flow()
+        if self._axes_topic:
+            self._axes = self.publish_on(undo, AxisBlock, self._axes_topic)
+        if self._distance_topic:
+            self._distance = self.publish_on(undo, DistanceBlock, self._distance_topic)
+
+    def activate(self, undo: ExitStack) -> None:
+        """Begin to read the device."""
+        stop = threading.Event()
+        thread = threading.Thread(target=self._reader.run, args=(stop,), daemon=True)
+        undo.callback(thread.join, timeout=_END_S)
+        undo.callback(stop.set)
+        thread.start()
 
     def _publish(self, blocks: Sequence[BlockPair]) -> None:
-        if not self.context.ok():
-            return
         for axes, distance in blocks:
             if axes is not None and self._axes is not None:
-                self._axes.publish(conversions.axis_message(self._messages, axes))
+                frame = self.values["machine_frame"]
+                self._axes.publish(conversions.axis_message(self._messages, axes, frame))
             if distance is not None and self._distance is not None:
-                self._distance.publish(conversions.distance_message(self._messages, distance))
+                frame = self.values["probe_frame"]
+                self._distance.publish(
+                    conversions.distance_message(self._messages, distance, frame)
+                )
 
-    def _report(self) -> tuple[bytes, str, dict[str, object]]:
-        statistics = self._device.identity | {"state": self._reader.state.value}
-        statistics |= self._device.counts() | {"connections": self._reader.connections}
-        for topic, publisher in self._topics.items():
-            if publisher is not None:
-                statistics[f"{topic}_subscribers"] = publisher.get_subscription_count()
+    def report(self) -> Report:
+        """Return what became of every sample, and what is wrong now."""
+        counts, now = self._device.counts(), time.monotonic()
+        self._flow.update(int(counts["decoded"]), now)
+        values: dict[str, object] = {**self._device.identity, "state": self._reader.state.value}
+        values |= counts | {"connections": self._reader.connections}
+        values["rate_hz"] = round(self._flow.rate, 3)
+        for topic, publisher in self._both():
+            values[f"{topic}_subscribers"] = publisher.get_subscription_count()
+        report = Report(f"reading at {self._flow.rate:.6g} Hz", values)
         if self._reader.trouble:
-            return ERROR, self._reader.trouble, statistics
-        seen = [key for key in statistics if key.startswith(_FAULTS) and statistics[key]]
-        return (WARN, f"seen: {', '.join(seen)}", statistics) if seen else (OK, "", statistics)
+            report.add(ERROR, self._reader.trouble)
+        self._add_faults(report, counts, now)
+        self._add_silence(report, now)
+        return report
 
-    def close(self) -> None:
-        """End the reading thread."""
-        self._stop.set()
-        self._thread.join(timeout=5.0)
+    def _both(self) -> list[tuple[str, Publisher]]:
+        both = ((self._axes_topic, self._axes), (self._distance_topic, self._distance))
+        return [(topic, publisher) for topic, publisher in both if topic and publisher]
+
+    def _add_faults(self, report: Report, counts: dict[str, float], now: float) -> None:
+        faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
+        if seen := self._recent.update(faults, now):
+            text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
+            report.add(WARN, f"just now: {text}")
+
+    def _add_silence(self, report: Report, now: float) -> None:
+        if self._reader.state is not State.READING:
+            return
+        patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])
+        silent = self._flow.silent(now)
+        if silent is None:
+            report.add(STALE, "connected, but no sample has come yet")
+        elif silent > patience:
+            report.add(STALE, f"no sample for {silent:.0f} s")

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
-from typing import Any
 
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
-from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
-from rclpy.node import Node
+from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
 from omsm_ros.errors import BagError, ConfigurationError
-from omsm_ros.nodes.running import (
-    ERROR,
-    LATCHED_QOS,
-    NAMESPACE,
-    OK,
-    SAMPLES_QOS,
-    WARN,
-    Diagnostics,
-    parameter,
-    run,
-)
+from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run
+from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_waiting
+from omsm_ros.parameters import Parameter
 from omsm_ros.storage.recording import topics
 from omsm_ros.storage.recording.bag_writer import BagWriter
 
+PARAMETERS = (
+    Parameter("path", "", "the .mcap file to write; it must not exist yet", required=True),
+)
 _TOPICS = {
     topics.AXES_TOPIC: AxisBlock,
     topics.DISTANCE_TOPIC: DistanceBlock,
@@ -43,117 +37,104 @@ _ON_ITS_WAY_S = 0.2  # a hundred times what a message takes on one machine
 _LONGEST_S = 2.0  # of publishers that are not ended; a launch waits for five
 
 
-class RecorderNode(Node):
+class RecorderNode(ManagedNode):
     """Takes messages as they are on the wire; what is older than a second is on the disk."""
 
     def __init__(self) -> None:
-        super().__init__("recorder", namespace=NAMESPACE)
-        path = parameter(self, "path", "", "the .mcap file to write; it must not exist yet")
+        super().__init__("recorder", PARAMETERS)
+
+    def hardware_id(self) -> str:
+        """Return the bag's path."""
+        return str(self.values.get("path", ""))
+
+    def configure(self, undo: ExitStack) -> None:
+        """Open the bag."""
+        path = self.values["path"]
         if not path.endswith(".mcap"):
             raise ConfigurationError(f"path {path!r} must name an .mcap file")
-        names = {t: self.resolve_topic_name(t.rpartition("/")[2]) for t in _TOPICS}
-        self._counts = dict.fromkeys(names.values(), 0)
-        self._lost = self._last_stamp = 0
-        self._failure: BagError | None = None
-        self._bag = BagWriter(path, tuple(_TOPICS), names)
+        self._names = {t: self.resolve_topic_name(t.rpartition("/")[2]) for t in _TOPICS}
+        self._counts = dict.fromkeys(self._names.values(), 0)
+        self._lost = dict.fromkeys(_TOPICS, 0)
+        self._last_stamp = 0
+        self._heard: dict[str, Subscription] = {}
+        self._bag = BagWriter(path, tuple(_TOPICS), self._names)
         self._bag.__enter__()
-        self._subscribed = {t: self._subscribe(t, kind, names[t]) for t, kind in _TOPICS.items()}
-        self.create_timer(_FLUSH_PERIOD_S, partial(self._attempt, self._bag.flush))
-        self._diagnostics = Diagnostics(self, self._report, hardware_id=path)
+        undo.callback(self._complete)
 
-    def _subscribe(self, topic: str, kind: Any, name: str) -> Subscription:
-        def take(cdr: bytes, info: dict[str, int]) -> None:
-            if self._write(topic, cdr, info["source_timestamp"]):
-                self._counts[name] += 1
-
-        latched = topic in topics.LATCHED_TOPICS
-        events = SubscriptionEventCallbacks(message_lost=self._on_lost)
-        return self.create_subscription(
-            kind, name, take, LATCHED_QOS if latched else SAMPLES_QOS,
-            event_callbacks=events, raw=True,
-        )  # fmt: skip
-
-    def _on_lost(self, event: QoSMessageLostInfo) -> None:
-        self._lost = event.total_count
+    def activate(self, undo: ExitStack) -> None:
+        """Begin to record; at the end, take what was published before it."""
+        for topic, kind in _TOPICS.items():
+            qos = LATCHED_QOS if topic in topics.LATCHED_TOPICS else SAMPLES_QOS
+            self._heard[topic] = listen(
+                self,
+                undo,
+                kind,
+                self._names[topic],
+                partial(self._take, topic),
+                qos,
+                raw=True,
+                lost=partial(self._lost.__setitem__, topic),
+            )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        flush = partial(self._written, self._bag.flush)
+        undo.callback(self.destroy_timer, self.create_timer(_FLUSH_PERIOD_S, flush, clock=steady))
+        undo.callback(self._heard.clear)
+        undo.callback(self._take_what_is_on_its_way)
 
     # ------------------------------------------------------------------------- writing
 
-    def _write(self, topic: str, cdr: bytes, published_ns: int) -> bool:
+    def _take(self, topic: str, cdr: bytes, info: MessageInfo) -> None:
         # A bag without an index is read in its order, which must be that of its stamps; the
         # clock of the machine may be set back.
         self._last_stamp = max(self._last_stamp, self.get_clock().now().nanoseconds)
-        return self._attempt(
-            partial(self._bag.write_raw, topic, self._last_stamp, cdr, published_ns)
-        )
+        write = partial(self._bag.write_raw, topic, self._last_stamp, cdr, info["source_timestamp"])
+        if self._written(write):
+            self._counts[self._names[topic]] += 1
 
-    def _attempt(self, write: Callable[[], None]) -> bool:
-        try:
-            write()
-        except BagError as err:
-            self._failure = err
-            self.get_logger().error(str(err))
-            self._diagnostics.publish()
-            self.context.try_shutdown()  # there is nothing left to do
-        return self._failure is None
+    def _written(self, write: Callable[[], object]) -> bool:
+        if self.fatal is None:
+            try:
+                write()
+            except BagError as err:
+                self.fatal = err  # there is nothing left to do
+                self.get_logger().error(f"{type(err).__name__}: {err}")
+                self.diagnostics.publish()
+        return self.fatal is None
 
-    def close(self) -> None:
-        """Take what was published before, and complete the file; BagError if there is no room."""
-        self._take_what_is_on_its_way()
+    def _complete(self) -> None:
         try:
             self._bag.__exit__(None, None, None)
-        finally:
-            if self._failure is not None:
-                raise self._failure
+        except BagError as err:
+            self.fatal = self.fatal or err
+            self.get_logger().error(f"{type(err).__name__}: {err}")
 
     def _take_what_is_on_its_way(self) -> None:
         begin = quiet_since = time.monotonic()
         while time.monotonic() < min(quiet_since + _ON_ITS_WAY_S, begin + _LONGEST_S):
-            if sum(self._take_waiting(each) for each in self._subscribed.values()):
+            if sum(take_waiting(s, partial(self._take, t)) for t, s in self._heard.items()):
                 quiet_since = time.monotonic()
             time.sleep(_ON_ITS_WAY_S / 20)
 
-    def _take_waiting(self, subscription: Subscription) -> int:
-        handle, count = subscription.handle, 0
-        with handle:
-            while (taken := handle.take_message(subscription.msg_type, True)) is not None:
-                subscription.callback(*taken)
-                count += 1
-        return count
-
     # --------------------------------------------------------------------- diagnostics
 
-    def _report(self) -> tuple[bytes, str, dict[str, object]]:
-        heard = {s.topic_name: s.get_publisher_count() for s in self._subscribed.values()}
-        values = {**self._counts, "lost": self._lost}
-        values |= {f"publishers_of_{name}": count for name, count in heard.items()}
-        if self._failure is not None:
-            return ERROR, str(self._failure), values
-        if self._lost:
-            return WARN, f"{self._lost} messages were lost on their way here", values
-        if not any(heard.values()):
-            return WARN, "recording, but nobody publishes what is recorded", values
-        return OK, "recording", values
-
-
-def _end_between_callbacks() -> None:
-    """Have SIGINT, SIGTERM and SIGHUP end the spinning, and never interrupt what is being written.
-
-    The handlers of rclpy end the spinning and then call these.
-    """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as below nohup
-        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGINT))
+    def report(self) -> Report:
+        """Return what was recorded, and lost."""
+        lost = sum(self._lost.values())
+        publishers = {s.topic_name: s.get_publisher_count() for s in self._heard.values()}
+        report = Report("recording", {**self._counts, "lost": lost})
+        report.values |= {f"publishers_of_{name}": n for name, n in publishers.items()}
+        if self.fatal is not None:
+            report.add(ERROR, str(self.fatal))
+        if lost:
+            report.add(WARN, f"{lost} messages were lost on their way here")
+        if self.active and not any(publishers.values()):
+            report.add(WARN, "recording, but nobody publishes what is recorded")
+        return report
 
 
 def main() -> None:
     """Entry point of ``ros2 run omsm_ros recorder``; exit code 2 if the disk took no more."""
-    _end_between_callbacks()
-    try:
-        run(RecorderNode)
-    except BagError as err:
-        print(f"{type(err).__name__}: {err}", file=sys.stderr)
-        sys.exit(2)
+    run(RecorderNode)
 
 
 if __name__ == "__main__":

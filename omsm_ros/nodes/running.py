@@ -1,4 +1,4 @@
-"""How every node of this package starts, takes what comes from outside, reports, and ends.
+"""How every node of this package starts, answers requests, and ends.
 
 No message, request or parameter ends a node: what is wrong is refused with its reason, and a
 defect of ours is logged, counted in the diagnostics, and survived.
@@ -7,115 +7,135 @@ defect of ours is logged, counted in the diagnostics, and survived.
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections import Counter
-from collections.abc import Callable, Mapping
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect
-from omsm_ros.quantities import Quantity
+from omsm_ros.nodes.diagnostics import survive
+from omsm_ros.nodes.managed import ManagedNode, Stage
+from omsm_ros.nodes.topics import REQUESTS_QOS
 from omsm_ros.storage import strict_json
 
-NAMESPACE = "omsm"
-
-SAMPLES_QOS = QoSProfile(
-    # Reliable, and deep enough for seconds of blocks: a loss must be a fault, not a policy.
-    reliability=ReliabilityPolicy.RELIABLE,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=2000,
-)
-LATCHED_QOS = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-)
-
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
-_COMPLAINT_PERIOD_S = 5.0
 _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
-_defects: Counter[str] = Counter()
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# A node that has not ended so long after it was asked to ends at the next signal, as it stands.
+_PATIENCE_S = 5.0
+# For a log message of a node that cannot start to reach who listens on /rosout.
+_LAST_WORDS_S = 1.0
 
 
-def run(make_node: Callable[[], Node]) -> None:
-    """Build a node and spin it until SIGINT or SIGTERM.
+def run(make_node: Callable[[], ManagedNode]) -> None:
+    """Build a node, start it and spin it until SIGINT, SIGTERM, SIGHUP or a requested shutdown.
 
-    Exits with one line on stderr if it cannot start: 2 for bad input, 70 for a defect of ours.
+    Exits with one line on stderr if it cannot start, or not go on: 2 for bad input, 70 for a
+    defect of ours.
     """
-    rclpy.init()
+    node = None
     try:
+        _init()
+        ending = _Ending()  # after rclpy, which puts back the handlers of the system
         node = make_node()
-    except OmsmError as err:
-        rclpy.try_shutdown()
-        print(f"{type(err).__name__}: {' '.join(str(err).split())}", file=sys.stderr)
-        sys.exit(_BAD_INPUT)
+        node.start()
     except Exception as err:
-        rclpy.try_shutdown()
-        if os.environ.get(DEBUG):
-            raise
-        print(defect(err), file=sys.stderr)
-        sys.exit(_DEFECT)
+        _give_up(node, err)
     try:
-        _spin(node)
+        _spin(node, ending)
     finally:
-        close = getattr(node, "close", None)
-        if close is not None:
-            close()
+        node.close()
         node.destroy_node()
         rclpy.try_shutdown()
+        ending.ignore_signals()
+    if node.fatal is not None:
+        sys.exit(_BAD_INPUT)
 
 
-def _spin(node: Node) -> None:
+def _init() -> None:
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except (
+        RuntimeError
+    ) as err:  # a parameter file that is missing or no YAML, an argument of no kind
+        raise ConfigurationError(str(err).split(", at ")[0]) from err
+
+
+def _give_up(node: ManagedNode | None, err: Exception) -> None:
+    known = isinstance(err, OmsmError)
+    if os.environ.get(DEBUG) and not known:
+        raise err
+    if node is None:
+        text = f"{type(err).__name__}: {' '.join(str(err).split())}" if known else defect(err)
+        print(text, file=sys.stderr)
+    else:  # the line is in the log already
+        time.sleep(_LAST_WORDS_S if node.count_subscribers("/rosout") else 0.0)
+    rclpy.try_shutdown()
+    sys.exit(_BAD_INPUT if known else _DEFECT)
+
+
+class _Ending:
+    """Hears signals to end, at any time and in any thread, and interrupts nothing.
+
+    A launch sends SIGINT twice; a handler that raises in the middle of an orderly end would leave
+    it half done.
+    """
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+        self._wake: Callable[[], object] = lambda: None
+        self._heard, told = os.pipe()
+        os.set_blocking(told, False)
+        for number in _ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as SIGHUP is below nohup
+                signal.signal(number, lambda *_: None)
+        signal.set_wakeup_fd(told)
+        threading.Thread(target=self._wait, daemon=True).start()
+
+    def wakes(self, wake: Callable[[], object]) -> None:
+        """Call ``wake`` when the signal comes."""
+        self._wake = wake
+        if self.asked.is_set():
+            wake()
+
+    def ignore_signals(self) -> None:
+        """Let none that is still to come spoil the exit code; Python lets go of its handlers."""
+        for number in _ENDING:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _wait(self) -> None:
+        asked = 0.0
+        while True:
+            (number,) = os.read(self._heard, 1)
+            if number not in _ENDING:
+                continue
+            if not asked:
+                asked = time.monotonic()
+                self.asked.set()
+                self._wake()
+            elif time.monotonic() - asked > _PATIENCE_S:
+                os._exit(128 + number)
+
+
+def _spin(node: ManagedNode, ending: _Ending) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while rclpy.ok():
+    ending.wakes(lambda: executor.create_task(lambda: None))
+    while not (ending.asked.is_set() or node.fatal or node.stage is Stage.FINALIZED):
         try:
             executor.spin_once()
-        except (KeyboardInterrupt, ExternalShutdownException):
-            return  # asked to end
         except Exception as err:
-            _survive(node, err)
-
-
-def _survive(node: Node, err: Exception) -> str:
-    """Count and log a defect of ours; return the line that says what to report."""
-    if os.environ.get(DEBUG):
-        raise err
-    _defects[node.get_fully_qualified_name()] += 1
-    line = defect(err)
-    node.get_logger().error(line, throttle_duration_sec=_COMPLAINT_PERIOD_S)
-    return line
+            survive(node, err)
 
 
 # ------------------------------------------------------------------------------- doors
-
-
-def parameter(
-    node: Node, name: str, default: Any, description: str, quantity: Quantity | None = None
-) -> Any:
-    """Declare a parameter, read once at the start, and return its value.
-
-    ConfigurationError if its type is wrong, or its value not plausible for ``quantity``.
-    """
-    from rcl_interfaces.msg import ParameterDescriptor
-
-    told = description if quantity is None else f"{description}; {quantity.range_text}"
-    # Read-only: to set it later would change nothing, and so must not succeed.
-    descriptor = ParameterDescriptor(description=told, read_only=True)
-    called = f"{node.get_name()}: parameter {name!r} ({description})"
-    try:
-        value = node.declare_parameter(name, default, descriptor).value
-    except InvalidParameterTypeException as err:
-        raise ConfigurationError(f"{called} has the wrong type: {err}") from err
-    return value if quantity is None else quantity.checked(value, ConfigurationError, called)
 
 
 def settings_of(text: str) -> dict[str, object]:
@@ -123,8 +143,10 @@ def settings_of(text: str) -> dict[str, object]:
     return strict_json.object_of(text, ConfigurationError, "parameter 'settings'")
 
 
-def serve(node: Node, kind: Any, name: str, answer: Callable[[Any, Any], None]) -> None:
-    """Offer the service ``name``; ``answer`` fills in the response from the request.
+def serve(
+    node: Node, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], None]
+) -> None:
+    """Offer the service ``name`` until ``undo``; ``answer`` fills in the response.
 
     Whatever it raises is answered as not successful (or not safe), with the reason.
     """
@@ -133,54 +155,18 @@ def serve(node: Node, kind: Any, name: str, answer: Callable[[Any, Any], None]) 
         try:
             answer(request, response)
         except OmsmError as err:
-            _refuse(response, str(err))
+            refuse(response, str(err))
         except Exception as err:
-            _refuse(response, _survive(node, err))
+            refuse(response, survive(node, err))
         return response
 
-    node.create_service(kind, name, callback)
+    made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS)
+    undo.callback(node.destroy_service, made)
 
 
-def _refuse(response: Any, reason: str) -> None:
+def refuse(response: Any, reason: str) -> None:
+    """Fill in a response that says no, and why."""
     for name in ("success", "safe"):
         if hasattr(response, name):
             setattr(response, name, False)
     response.message = reason
-
-
-class Diagnostics:
-    """Publishes one status of a node on ``/diagnostics`` every ``period`` seconds.
-
-    report: returns level, message and values; called from the node's executor.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        report: Callable[[], tuple[bytes, str, Mapping[str, object]]],
-        *,
-        hardware_id: str = "",
-        period: float = 0.5,
-    ) -> None:
-        self._node = node
-        self._report = report
-        self._hardware_id = hardware_id
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(period, self.publish)
-
-    def publish(self) -> None:
-        """Publish now; a node with a defect says so until it is started again."""
-        level, message, values = self._report()
-        if defects := _defects[self._node.get_fully_qualified_name()]:
-            level, message = ERROR, f"{defects} defects of ours, see the log; {message}"
-            values = {**values, "defects": defects}
-        status = DiagnosticStatus(
-            level=level,
-            name=self._node.get_fully_qualified_name(),
-            message=message,
-            hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array)

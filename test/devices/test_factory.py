@@ -17,13 +17,16 @@ from omsm_ros.devices.factory import (
     make_device,
     make_reference,
 )
-from omsm_ros.emulators.players import EMULATED
+from omsm_ros.emulators.players import EMULATED, emulated
 from omsm_ros.errors import ConfigurationError
+
+# What a device measures with must be stated; the emulated one's scales will do.
+STATED = emulated("six_channel").driver
 
 
 @pytest.mark.parametrize("name", DEVICES)
 def test_every_device_is_made_from_the_defaults(name: str) -> None:
-    device = make_device(defaults() | {"device": name, "port": "tcp://device.invalid:1"})
+    device = make_device(defaults() | STATED | {"device": name, "port": "tcp://device.invalid:1"})
     assert device.statistics.decoded == 0
     assert device.identity == {}
 
@@ -32,8 +35,8 @@ def test_every_emulated_device_has_its_driver() -> None:
     # A probe without encoders is no whole cell.
     assert set(EMULATED) == set(DEVICES) - {"confocaldt"}
     names = {parameter.name for parameter in PARAMETERS}
-    for emulated in EMULATED.values():
-        assert set(emulated.driver) <= names
+    for each in EMULATED.values():
+        assert set(each.driver) <= names
 
 
 @pytest.mark.parametrize(
@@ -44,24 +47,29 @@ def test_every_emulated_device_has_its_driver() -> None:
         ({"device": "chrocodile", "encoders": "XYZ"}, "encoders 'XYZ'"),
         ({"device": "chrocodile", "trigger": "never"}, "trigger 'never'"),
         ({"port": "tcp://host"}, "tcp://host:port"),
+        ({"z.counts_per_unit": 0.0}, "'z.counts_per_unit' is not stated"),
+        (
+            {"device": "six_channel_text", "b.counts_per_unit": 0.0},
+            "'b.counts_per_unit' is not stated",
+        ),
         ({"x.sign": 0}, "sign 0"),
     ],
 )
 def test_senseless_parameters_are_named(wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ConfigurationError, match=named):
-        make_device(defaults() | wrong)
+        make_device(defaults() | STATED | wrong)
 
 
 def test_parameters_reach_the_device() -> None:
     values = {"device": "chrocodile", "encoders": "XYZVU", "lamp": 30.0, "probe.zero": 5e-5}
-    settings = make_device(defaults() | values)._wanted  # type: ignore[attr-defined]
+    settings = make_device(defaults() | STATED | values)._wanted  # type: ignore[attr-defined]
     assert settings.encoders == (0, 1, 2, 4, 3)
     assert (settings.lamp, settings.averaging) == (30.0, None)
     assert settings.probe.zero == 5e-5
 
 
 def test_a_reference_is_made_from_its_defaults() -> None:
-    values = defaults(REFERENCE_PARAMETERS)
+    values = defaults(REFERENCE_PARAMETERS) | {"port": "tcp://169.254.168.150:10001"}
     assert make_reference(values).statistics.decoded == 0
     assert make_reference(values | {"command_port": 23}).identity == {}
     with pytest.raises(ConfigurationError, match="device 'ruler'"):
@@ -78,7 +86,7 @@ def test_commands_go_to_the_same_host() -> None:
 
 
 def test_axes_alone_are_made_from_their_defaults() -> None:
-    values = defaults(AXIS_PARAMETERS) | {"columns": "sequence x y z b c"}
+    values = defaults(AXIS_PARAMETERS) | STATED | {"columns": "sequence x y z b c"}
     device = make_axes(values | {"device": "six_channel_text"})
     assert not device.channels.distance
     with pytest.raises(ConfigurationError, match="device 'chrocodile'"):

@@ -24,7 +24,7 @@ from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.emulators.chrocodile import ChrocodileEmulator
 from omsm_ros.emulators.instrument import Instrument
 from omsm_ros.emulators.micro_epsilon import CapaNcdtEmulator
-from omsm_ros.emulators.players import line_for
+from omsm_ros.emulators.players import emulated, line_for
 from omsm_ros.emulators.tcp_server import TcpServer
 
 SOON = 20.0
@@ -63,7 +63,8 @@ def reading(device: StreamDevice) -> Iterator[tuple[DeviceReader, list[BlockPair
 
 
 def probe(path: str) -> StreamDevice:
-    return make_device(defaults() | {"device": "chrocodile", "port": path, "encoders": "XYZUV"})
+    wired = emulated("chrocodile").driver | {"trigger": "free_run", "probe.zero": 0.0}
+    return make_device(defaults() | wired | {"device": "chrocodile", "port": path})
 
 
 def checked(got: list[BlockPair]) -> None:

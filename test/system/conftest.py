@@ -17,55 +17,66 @@ def ros():
     rclpy.try_shutdown()
 
 
+class Cell:
+    """Starts nodes, looks at their diagnostics, calls their services."""
+
+    def __init__(self, folder, processes):
+        from omsm_ros.nodes.cell_demo_node import DemoNode
+
+        self.folder, self.link = folder, str(folder / "port")
+        self.processes = processes
+        self.operator = DemoNode(processes)
+
+    def start_emulator(self, **parameters):
+        given = {"link": self.link, "time_lapse": 20.0, "start_radius": 1e-3, "seed": 3}
+        self.processes.start("cell_emulator", **(given | parameters))
+
+    def start_driver(self, **parameters):
+        from omsm_ros.emulators.players import emulated
+
+        given = {"port": self.link} | emulated("six_channel").driver
+        self.processes.start("confocal_driver", **(given | parameters))
+
+    def call(self, kind, name, **fields):
+        return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
+
+    def wait(self, what, done):
+        self.operator.wait_until(what, done)
+
+    def publisher(self, topic, message, listeners=1):
+        """A publisher of samples that ``listeners`` nodes have found."""
+        from omsm_ros.nodes.topics import SAMPLES_QOS
+
+        made = self.operator.create_publisher(message, f"/omsm/{topic}", SAMPLES_QOS)
+        self.wait(f"who hears {topic}", lambda: made.get_subscription_count() >= listeners)
+        return made
+
+    def clouds(self):
+        """A list that fills with what appears on /omsm/points while the operator spins."""
+        from sensor_msgs.msg import PointCloud2
+
+        from omsm_ros.nodes.topics import SAMPLES_QOS
+
+        seen = []
+        self.operator.create_subscription(PointCloud2, "/omsm/points", seen.append, SAMPLES_QOS)
+        return seen
+
+    def settle(self, node, key):
+        """Wait until a count has stood still for a while and return it."""
+        last, since = -1, time.monotonic()
+        while time.monotonic() - since < 2.5:
+            rclpy.spin_once(self.operator, timeout_sec=0.1)
+            if (now := self.operator.value(node, key)) != last:
+                last, since = now, time.monotonic()
+        return last
+
+
 @pytest.fixture
 def cell(tmp_path):
-    """Start nodes, look at their diagnostics, call their services; all end with the test."""
-    from sensor_msgs.msg import PointCloud2
-
-    from omsm_ros.nodes.cell_demo_node import DemoNode
+    """All that is started ends with the test."""
     from omsm_ros.nodes.processes import NodeProcesses
-    from omsm_ros.nodes.running import SAMPLES_QOS
-
-    class Cell:
-        link = str(tmp_path / "port")
-        folder = tmp_path
-
-        def __init__(self, processes):
-            self.processes = processes
-            self.operator = DemoNode(processes)
-
-        def start_emulator(self, **parameters):
-            given = {"link": self.link, "time_lapse": 20.0, "start_radius": 1e-3, "seed": 3}
-            self.processes.start("cell_emulator", **(given | parameters))
-
-        def call(self, kind, name, **fields):
-            return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
-
-        def wait(self, what, done):
-            self.operator.wait_until(what, done)
-
-        def publisher(self, topic, message, listeners=1):
-            """A publisher of samples that ``listeners`` nodes have found."""
-            made = self.operator.create_publisher(message, f"/omsm/{topic}", SAMPLES_QOS)
-            self.wait(f"who hears {topic}", lambda: made.get_subscription_count() >= listeners)
-            return made
-
-        def clouds(self):
-            """A list that fills with what appears on /omsm/points while the operator spins."""
-            seen = []
-            self.operator.create_subscription(PointCloud2, "/omsm/points", seen.append, SAMPLES_QOS)
-            return seen
-
-        def settle(self, node, key):
-            """Wait until a count has stood still for a second and return it."""
-            last, since = -1, time.monotonic()
-            while time.monotonic() - since < 1.5:
-                rclpy.spin_once(self.operator, timeout_sec=0.1)
-                if (now := self.operator.value(node, key)) != last:
-                    last, since = now, time.monotonic()
-            return last
 
     with NodeProcesses(tmp_path / "log") as processes:
-        made = Cell(processes)
+        made = Cell(tmp_path, processes)
         yield made
         made.operator.destroy_node()

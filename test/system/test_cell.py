@@ -60,7 +60,7 @@ def start_correcting(cell, calibration, **emulator):
     path = cell.folder / "cal.json"
     save_calibration(path, calibration)
     cell.start_emulator(**emulator)
-    cell.processes.start("confocal_driver", port=cell.link)
+    cell.start_driver()
     cell.processes.start("corrector", calibration=str(path))
     cell.wait(
         "the nodes",
@@ -146,7 +146,7 @@ def test_noise_on_the_wire(cell, true_calibration):
 
 def test_corrector_without_calibration_counts_and_waits(cell, true_calibration):
     cell.start_emulator()
-    cell.processes.start("confocal_driver", port=cell.link)
+    cell.start_driver()
     cell.processes.start("corrector")
     cell.wait(
         "the driver",

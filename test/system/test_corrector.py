@@ -11,7 +11,7 @@ from omsm_msgs.msg import DistanceBlock as DistanceMessage
 from omsm_msgs.srv import LoadCalibration, PredictError
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.nodes.running import LATCHED_QOS
+from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.storage import bags, conversions
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.recording.bag_writer import BagWriter

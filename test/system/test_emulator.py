@@ -7,7 +7,7 @@ import pytest
 from omsm_msgs.msg import AxisBlock
 from std_srvs.srv import Trigger
 
-from omsm_ros.nodes.running import SAMPLES_QOS
+from omsm_ros.nodes.topics import SAMPLES_QOS
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -47,7 +47,7 @@ def test_the_file_of_disturbances_is_played(cell):
     file = cell.folder / "disturbances.yaml"
     file.write_text("encoder: {scale_ppm: 10000}\n")
     cell.start_emulator(disturbances=str(file))
-    cell.processes.start("confocal_driver", port=cell.link)
+    cell.start_driver()
     blocks = []
     cell.operator.create_subscription(AxisBlock, "/omsm/axes", blocks.append, SAMPLES_QOS)
     cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)

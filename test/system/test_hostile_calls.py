@@ -9,7 +9,7 @@ import pytest
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 
-from omsm_ros.nodes.running import LATCHED_QOS
+from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_file import save_calibration
 
@@ -86,7 +86,7 @@ def hostile_calibrations(good):
 
 def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small_scan_blocks):
     cell.processes.start("corrector")
-    cell.processes.start("calibrator")
+    cell.processes.start("calibrator", output=str(cell.folder / "cal.json"))
     latched = cell.operator.create_publisher(Calibration, "/omsm/calibration", LATCHED_QOS)
     cell.wait("the corrector to listen", lambda: latched.get_subscription_count() >= 1)
     for message in hostile_calibrations(true_calibration):

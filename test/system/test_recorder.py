@@ -11,7 +11,7 @@ import rclpy
 from omsm_msgs.msg import AxisBlock, Calibration
 
 from omsm_ros.core.samples import blocks
-from omsm_ros.nodes.running import LATCHED_QOS
+from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.storage import bags, conversions
 from omsm_ros.storage.recording.bag_repair import repair
 

@@ -25,7 +25,7 @@ def test_half_an_hour(cell, true_calibration):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
     cell.start_emulator(time_lapse=1.0, start_radius=START_RADIUS_M, feed_per_turn=FEED_PER_TURN_M)
-    cell.processes.start("confocal_driver", port=cell.link)
+    cell.start_driver()
     cell.processes.start("corrector", calibration=str(path))
     value = cell.operator.value
     cell.wait(

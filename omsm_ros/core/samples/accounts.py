@@ -1,6 +1,7 @@
 """Where did every sample go?
 
-For each stream ``received == corrected + pending + sum(counted.values())`` at any time.
+For each stream ``received == corrected + pending + sum(counted.values())`` at any time. What
+never came is none of these: trigger counts that a session left out are ``missing``.
 """
 
 from __future__ import annotations
@@ -36,12 +37,16 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class StreamAccount:
-    """One stream: samples received, turned into points, still waiting, and counted by reason."""
+    """One stream: samples received, turned into points, still waiting, and counted by reason.
+
+    missing: trigger counts that never came, between the first and the last of each session
+    """
 
     received: int = 0
     corrected: int = 0
     pending: int = 0
     counted: Mapping[str, int] = field(default_factory=dict)
+    missing: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class Tally:
 
     def __init__(self) -> None:
         self.received = 0
+        self.missing = 0
         self.corrected = 0
         self._counted: Counter[Reason] = Counter()
 
@@ -79,4 +85,4 @@ class Tally:
     def snapshot(self, pending: int) -> StreamAccount:
         """The account as it stands with ``pending`` samples waiting."""
         counted = {reason.name.lower(): n for reason, n in sorted(self._counted.items()) if n}
-        return StreamAccount(self.received, self.corrected, pending, counted)
+        return StreamAccount(self.received, self.corrected, pending, counted, self.missing)

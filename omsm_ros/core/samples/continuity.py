@@ -9,7 +9,7 @@ times the sample period, when a recording is played in time lapse.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -25,12 +25,14 @@ class Arrival:
 
     session: rises when the count begins anew;  first: count of the block's first sample
     skip: leading samples to leave out, of which ``late`` fill a gap and the others were seen before
+    missing: trigger counts left out just before
     """
 
     session: int
     first: int
     skip: int
     late: int
+    missing: int = field(default=0, compare=False)
 
 
 class TriggerCount:
@@ -45,20 +47,21 @@ class TriggerCount:
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
-        first = block.first_sample
+        first, missing = block.first_sample, 0
         if self._begins_anew(first, block):
             self._session += 1
             self._next = first
             self._gaps.clear()
         elif first > self._next:
             self._gaps.append((self._next, first))
+            missing = first - self._next
         end = first + length
         skip = min(max(self._next - first, 0), length)
         late = sum(max(min(b, first + skip) - max(a, first), 0) for a, b in self._gaps)
         if skip < length:
             self._next = end
             self._newest_first, self._newest_stamp_ns = first, block.stamp_ns
-        return Arrival(self._session, first, skip, min(late, skip))
+        return Arrival(self._session, first, skip, min(late, skip), missing)
 
     def end(self) -> None:
         """Whatever comes next begins a session."""

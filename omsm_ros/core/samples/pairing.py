@@ -87,6 +87,7 @@ class Intake:
         """Count the samples of ``block``; None if all were there before, or came too late."""
         arrival = self._count.place(block, len(block))
         self.tally.received += len(block)
+        self.tally.missing = max(self.tally.missing + arrival.missing - arrival.late, 0)
         self.tally.count(Reason.LATE, arrival.late)
         self.tally.count(Reason.DUPLICATE, arrival.skip - arrival.late)
         return arrival if arrival.skip < len(block) else None

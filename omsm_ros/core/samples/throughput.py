@@ -18,10 +18,17 @@ class LoadMeter:
     def __init__(self, window: int = 10_000) -> None:
         self._latencies: deque[int] = deque(maxlen=window)
         self._cpu = self._wall = 0.0
+        self._worst_ns = 0
 
     def block(self, arrived_ns: int, done_ns: int) -> None:
         """A block that arrived at ``arrived_ns`` was dealt with at ``done_ns`` [ns]."""
         self._latencies.append(done_ns - arrived_ns)
+        self._worst_ns = max(self._worst_ns, done_ns - arrived_ns)
+
+    def worst_ms(self) -> float:
+        """Return the greatest latency since the last call [ms]."""
+        worst, self._worst_ns = self._worst_ns, 0
+        return worst * NANOSECOND_S / MILLISECOND_S
 
     def report(self, cpu: float, wall: float) -> dict[str, float]:
         """Median, 99 % point, maximum of the latency [ms]; share of a core since the last report.

@@ -1,0 +1,84 @@
+"""Work that takes seconds, done beside the samples, which go on being taken meanwhile."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Awaitable, Callable
+from contextlib import ExitStack
+from typing import Any, TypeVar
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.task import Future
+
+from omsm_ros.errors import OmsmError
+from omsm_ros.nodes.diagnostics import survive
+from omsm_ros.nodes.running import refuse
+from omsm_ros.nodes.topics import REQUESTS_QOS
+
+T = TypeVar("T")
+
+# As many may wait; who comes then is answered at once, that he has to come again.
+_MOST_WAITING = 8
+
+
+class Aside:
+    """One thread that works for a node, and services that wait for it without stopping the node."""
+
+    def __init__(self, node: Node, undo: ExitStack) -> None:
+        self._node = node
+        self._work: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
+        self._group = ReentrantCallbackGroup()
+        self.waiting = 0
+        threading.Thread(target=self._run, daemon=True).start()
+        undo.callback(self._work.put, None)
+
+    async def do(self, work: Callable[[], T]) -> T:
+        """Return what ``work`` returns, or raise what it raises.
+
+        Raises OmsmError if too many wait already.
+        """
+        if self.waiting >= _MOST_WAITING:
+            raise OmsmError(f"busy: {self.waiting} requests are being worked on; ask again later")
+        self.waiting += 1
+        done = Future()
+        self._work.put((work, done))
+        try:
+            return await done  # type: ignore[no-any-return]
+        finally:
+            self.waiting -= 1
+
+    def serve(
+        self,
+        undo: ExitStack,
+        kind: Any,
+        name: str,
+        answer: Callable[[Any, Any], Awaitable[None]],
+    ) -> None:
+        """Offer the service ``name``; as ``running.serve``, for an ``answer`` that awaits."""
+
+        async def callback(request: Any, response: Any) -> Any:
+            try:
+                await answer(request, response)
+            except OmsmError as err:
+                refuse(response, str(err))
+            except Exception as err:
+                refuse(response, survive(self._node, err))
+            return response
+
+        made = self._node.create_service(
+            kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=self._group
+        )
+        undo.callback(self._node.destroy_service, made)
+
+    def _run(self) -> None:
+        while (task := self._work.get()) is not None:
+            work, done = task
+            try:
+                done.set_result(work())
+            except Exception as err:  # told by who awaits it
+                done.set_exception(err)
+            # The executor looks at who waits only when something else wakes it.
+            if (executor := self._node.executor) is not None:
+                executor.wake()

@@ -1,0 +1,97 @@
+"""The topic ``calibration``: it tells the one in force, in whatever order nodes start again.
+
+Its stamp is the time since when it is in force. Every node that deals with calibrations listens,
+and whoever hears a newer one says it again: so all that is latched is the newest, and one of the
+nodes may be restarted without it being forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from omsm_msgs.msg import Calibration as CalibrationMessage
+from rclpy.node import Node
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.errors import OmsmError
+from omsm_ros.nodes import topics
+from omsm_ros.storage import conversions
+
+TOPIC = "calibration"
+_COMPLAINT_PERIOD_S = 5.0
+# Two nodes that refuse each other's calibration do not fill the network with it.
+_REPEAT_NS = 5 * 10**9
+# Clocks of a cell's computers agree to much less.
+_AHEAD_NS = 10 * 10**9
+
+
+class CalibrationTopic:
+    """Tells what its node puts in force, hands it what others do.
+
+    calibration, since_ns: in force, and since when [ns]; None before there is one
+    refused: why the last one heard was not taken; empty if it was
+    """
+
+    def __init__(
+        self, node: Node, undo: ExitStack, take: Callable[[Calibration, int], None], listens: bool
+    ) -> None:
+        """take: called with each newer calibration that is heard; raises OmsmError to refuse."""
+        self.calibration: Calibration | None = None
+        self.since_ns = 0
+        self.refused = ""
+        self._node, self._take = node, take
+        self._repeated_ns = 0
+        self._messages = conversions.ros_messages()
+        # Both are made without a check for rivals: here more than one may speak.
+        self._publisher = topics.publish_on(
+            node, undo, CalibrationMessage, TOPIC, topics.LATCHED_QOS
+        )
+        if listens:
+            topics.listen(
+                node, undo, CalibrationMessage, TOPIC, self._on_message, topics.LATCHED_QOS
+            )
+
+    def decided(self) -> int:
+        """Return the stamp of what is put in force now: later than all that was before [ns]."""
+        return max(self._now_ns(), self.since_ns + 1)
+
+    def tell(self, calibration: Calibration, since_ns: int) -> None:
+        """Say that ``calibration`` is in force since ``since_ns`` [ns]."""
+        self.calibration, self.since_ns, self.refused = calibration, since_ns, ""
+        message = conversions.calibration_message(self._messages, calibration, since_ns)
+        self._publisher.publish(message)
+
+    def _on_message(self, message: Any, _: topics.MessageInfo) -> None:
+        since_ns = self._plausible(conversions.stamp_of(message))
+        known = self.calibration
+        if known is not None and (message.id == known.id or since_ns <= self.since_ns):
+            return
+        try:
+            heard = conversions.calibration(message)
+            self._take(heard, since_ns)
+        except OmsmError as err:
+            self.refused = str(err)
+            self._node.get_logger().error(
+                f"calibration refused: {err}", throttle_duration_sec=_COMPLAINT_PERIOD_S
+            )
+            self._insist()
+            return
+        self.tell(heard, since_ns)
+
+    def _insist(self) -> None:
+        """Say again, as the newest, what stays in force."""
+        now = self.decided()
+        if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:
+            self._repeated_ns, refused = now, self.refused
+            self.tell(self.calibration, now)
+            self.refused = refused
+
+    def _plausible(self, stamp_ns: int) -> int:
+        """Of a message without a stamp, or from a clock that is ahead: now."""
+        now = self._now_ns()
+        return stamp_ns if 0 < stamp_ns < now + _AHEAD_NS else max(now, self.since_ns + 1)
+
+    def _now_ns(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)

@@ -1,0 +1,80 @@
+"""What can be set on the corrector, and the options that it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from omsm_ros import quantities
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.parameters import Parameter
+from omsm_ros.quantities import Quantity
+
+_AS_CALIBRATED = -1.0
+_GEOMETRY_OF = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
+_SOURCE_OF: dict[str, Quantity] = {
+    "static_gain": quantities.GAIN_UNCERTAINTY,
+    "lateral_lag": quantities.TIME_UNCERTAINTY,
+    "pitch": quantities.ANGLE_UNCERTAINTY,
+}
+
+PARAMETERS = (
+    Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
+    Parameter(
+        "calibration_folders",
+        "",
+        "what load_calibration may read from, separated by ':'; empty = any folder",
+    ),
+    Parameter("follow_calibrator", True, "take what appears on the topic calibration"),
+    Parameter("settings", "{}", "JSON object of how the cell is set now; {} = not compared"),
+    Parameter("override", False, "use a calibration that does not belong; every cloud says so"),
+    Parameter("polarity", 1, "+1: distance falls as z rises; -1: reversed", choices=(1, -1)),
+    Parameter(
+        "lateral_lag",
+        _AS_CALIBRATED,
+        "of the probe against X and C [s]; -1 = as calibrated",
+        quantities.LAG,
+        unset=_AS_CALIBRATED,
+    ),
+    Parameter("workpiece_frame", "workpiece", "frame of the points"),
+    Parameter("machine_frame", "machine", "frame of the axes"),
+    Parameter("probe_frame", "probe", "frame of the distance"),
+    *(
+        Parameter(
+            f"geometry.{field.name}",
+            0.0,
+            "of the probe, see `omsm align`",
+            _GEOMETRY_OF.get(field.name, quantities.LENGTH),
+        )
+        for field in fields(Geometry)
+    ),
+    *(
+        Parameter(
+            f"sources.{field.name}",
+            0.0,
+            "standard uncertainty, k = 1; 0 = what the certificate tells",
+            _SOURCE_OF.get(field.name, quantities.UNCERTAINTY),
+        )
+        for field in fields(ErrorSources)
+    ),
+)
+
+
+def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
+    """Return how to correct."""
+    lag = values["lateral_lag"]
+    return CorrectionOptions(
+        polarity=values["polarity"],
+        accept_other_rate=values["override"],
+        lateral_lag=None if lag == _AS_CALIBRATED else lag,
+        geometry=Geometry(**{f.name: values[f"geometry.{f.name}"] for f in fields(Geometry)}),
+    )
+
+
+def sources_of(values: Mapping[str, Any]) -> dict[str, float]:
+    """Return what is stated of the uncertainties; the certificate tells the others."""
+    stated = {f.name: values[f"sources.{f.name}"] for f in fields(ErrorSources)}
+    return {name: value for name, value in stated.items() if value}

@@ -1,0 +1,94 @@
+"""What the corrector says of itself: starved, refusing, losing, behind, or correcting."""
+
+from __future__ import annotations
+
+from omsm_ros.core.correction.correct import Corrector
+from omsm_ros.core.samples.recent import Flow, RecentIncrease
+from omsm_ros.core.samples.throughput import LoadMeter
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
+
+_STREAMS = ("axes", "distance")
+# Longer than the pauses within a step test; five samples of a slow device.
+_SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
+# Of the two seconds of small blocks that wait at most, half.
+_BEHIND_MS = 1000.0
+# Reasons that tell of something lost on the way, unlike a probe that looks past its target.
+_LOSSES = ("unmatched", "late", "overdue")
+
+
+class CorrectionState:
+    """Counts what the core never sees, and weighs both."""
+
+    def __init__(self) -> None:
+        self.uncalibrated = dict.fromkeys(_STREAMS, 0)
+        self.refused = dict.fromkeys(_STREAMS, 0)
+        self.refusal = ""
+        self.published = 0
+        self.load = LoadMeter()
+        self._heard = dict.fromkeys(_STREAMS, 0)
+        self._period = dict.fromkeys(_STREAMS, 0.0)
+        self._flows = {stream: Flow() for stream in _STREAMS}
+        self._recent = RecentIncrease()
+
+    def heard(self, stream: str, samples: int, period: float) -> None:
+        """Note a block, whatever becomes of it."""
+        self._heard[stream] += samples
+        self._period[stream] = period
+
+    def report(self, corrector: Corrector | None, now: float, cpu: float) -> Report:
+        """Weigh the state; ``corrector`` is None without a calibration."""
+        report = Report("correcting", {"clouds_published": self.published})
+        for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
+            report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
+        self._add_starved(report, now)
+        if corrector is None:
+            report.add(WARN, "no calibration: nothing is published")
+            return report
+        report.values |= self.load.report(cpu, now)
+        report.values["stamp_skew_s"] = corrector.stamp_skew
+        report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}
+        self._add_losses(report, self._account(report, corrector), now)
+        waited = self.load.worst_ms()
+        if waited > _BEHIND_MS:
+            report.add(WARN, f"falls behind: samples waited {waited / 1000:.1f} s")
+        return report
+
+    def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
+        """Enter every count of the account; return those that may tell of trouble."""
+        watched: dict[str, float] = {}
+        for stream, account in corrector.account.as_dict().items():
+            counts: dict[str, int] = {**account}  # type: ignore[dict-item]
+            counted: dict[str, int] = counts.pop("counted")  # type: ignore[assignment]
+            missing = counts.pop("missing")
+            report.values[f"missing_{stream}"] = watched[f"{stream} missing"] = missing
+            for name, value in (counts | counted).items():
+                report.values[f"{stream}_{name}"] = value
+                if name in _LOSSES:
+                    watched[f"{stream} {name}"] = value
+            watched[f"{stream} refused"] = self.refused[stream]
+            watched[f"{stream} received"] = counts["received"]
+        return watched
+
+    def _add_losses(self, report: Report, watched: dict[str, float], now: float) -> None:
+        rises = self._recent.update(watched, now)
+        for stream in _STREAMS:
+            received = rises.pop(f"{stream} received", 0)
+            refused = rises.pop(f"{stream} refused", 0)
+            if refused and not received:
+                report.add(ERROR, f"every block of {stream} is refused: {self.refusal}")
+            elif refused:
+                report.add(WARN, f"just now: {refused:.0f} samples of {stream} refused")
+        if rises:
+            text = ", ".join(f"{name} {rise:.0f}" for name, rise in rises.items())
+            report.add(WARN, f"just now: {text}")
+
+    def _add_starved(self, report: Report, now: float) -> None:
+        for stream, flow in self._flows.items():
+            flow.update(self._heard[stream], now)
+            report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
+            silent = flow.silent(now)
+            patience = max(_SILENCE_S, _SILENCE_SAMPLES * self._period[stream])
+            if silent is None:
+                report.add(STALE, f"no {stream} has come yet")
+            elif silent > patience:
+                report.add(STALE, f"no {stream} for {silent:.0f} s")

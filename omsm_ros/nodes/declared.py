@@ -1,0 +1,108 @@
+"""A node's parameters as ROS sees them: declared once, checked at each door, no others."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.parameters import Parameter
+
+_QOS_PREFIX = "qos_overrides."
+
+
+class Declared:
+    """Declares ``parameters`` on ``node``; one that is wrong keeps the node from being configured.
+
+    refusal: why no parameter may be set now; empty if they may
+    """
+
+    def __init__(
+        self, node: Node, parameters: Sequence[Parameter], refusal: Callable[[], str]
+    ) -> None:
+        self._node, self._refusal = node, refusal
+        self._parameters = {parameter.name: parameter for parameter in parameters}
+        self._wrong: dict[str, ConfigurationError] = {}
+        # rclpy ignores what is given but never declared; here it is an error.
+        self._given = dict(node._parameter_overrides)
+        for parameter in parameters:
+            self._declare(parameter)
+        node.add_on_set_parameters_callback(self._on_set)
+
+    def _declare(self, parameter: Parameter) -> None:
+        value: Any = parameter.default
+        if parameter.name in self._given:
+            try:
+                value = parameter.checked(self._given[parameter.name].value)
+            except ConfigurationError as err:
+                self._wrong[parameter.name] = err
+        self._node.declare_parameter(
+            parameter.name, value, _descriptor(parameter), ignore_override=True
+        )
+
+    def values(self) -> dict[str, Any]:
+        """Return every parameter by name.
+
+        Raises ConfigurationError for one that is wrong, missing, or known to nobody.
+        """
+        try:
+            for err in self._wrong.values():
+                raise err
+            self._check_known([name for name in self._given if not name.startswith(_QOS_PREFIX)])
+            return {
+                name: parameter.checked(self._node.get_parameter(name).value)
+                for name, parameter in self._parameters.items()
+            }
+        except ConfigurationError as err:
+            raise ConfigurationError(f"{self._node.get_name()}: {err}") from err
+
+    def check_overrides(self) -> None:
+        """Raise ConfigurationError for a qos_overrides.* of a topic that the node does not have."""
+        self._check_known([name for name in self._given if name.startswith(_QOS_PREFIX)])
+
+    def _check_known(self, names: Sequence[str]) -> None:
+        for name in names:
+            if not self._node.has_parameter(name):
+                near = difflib.get_close_matches(name, self._parameters, 1)
+                hint = f"did you mean {near[0]!r}?" if near else "`ros2 param list` shows them all"
+                raise ConfigurationError(f"unknown parameter {name!r}; {hint}")
+
+    def _on_set(self, wanted: list[RosParameter]) -> SetParametersResult:
+        for given in wanted:
+            parameter = self._parameters.get(given.name)
+            if parameter is None:
+                continue
+            try:
+                parameter.checked(given.value)
+            except ConfigurationError as err:
+                return SetParametersResult(successful=False, reason=str(err))
+            if refusal := self._refusal():
+                return SetParametersResult(successful=False, reason=f"{given.name!r} {refusal}")
+        for given in wanted:
+            self._wrong.pop(given.name, None)
+        return SetParametersResult(successful=True)
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=parameter.text, read_only=parameter.fixed)
+    quantity = parameter.quantity
+    if quantity is None or quantity.signed:
+        return descriptor
+    stated = [value for value in (parameter.default, parameter.unset) if value is not None]
+    low, high = min(quantity.low, *stated), max(quantity.high, *stated)  # type: ignore[type-var]
+    if type(parameter.default) is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+    else:
+        span = FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        descriptor.floating_point_range = [span]
+    return descriptor

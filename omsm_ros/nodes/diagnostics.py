@@ -1,0 +1,98 @@
+"""What a node says of itself once a second: its state now as a level, its history as numbers.
+
+OK: it does what it was asked to.  WARN: it does, but somebody should look.  STALE: it would, but
+nothing comes.  ERROR: it cannot. What went wrong longer than WINDOW_S ago is a number only.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from omsm_ros.errors import DEBUG, defect
+
+PERIOD_S = 1.0
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+STALE = DiagnosticStatus.STALE
+
+_SEVERITY = (OK, WARN, STALE, ERROR)
+_COMPLAINT_PERIOD_S = 5.0
+_defects: Counter[str] = Counter()
+
+
+@dataclass
+class Report:
+    """message: said when nothing is found;  values: history and figures, by name."""
+
+    message: str
+    values: dict[str, object] = field(default_factory=dict)
+    findings: list[tuple[bytes, str]] = field(default_factory=list)
+
+    def add(self, level: bytes, text: str) -> None:
+        """Enter something that is so now."""
+        self.findings.append((level, text))
+
+    @property
+    def level(self) -> bytes:
+        """The gravest."""
+        return max((level for level, _ in self.findings), key=_SEVERITY.index, default=OK)
+
+    @property
+    def text(self) -> str:
+        """Every finding, the gravest first; the message if there is none."""
+        ordered = sorted(self.findings, key=lambda found: -_SEVERITY.index(found[0]))
+        return "; ".join(text for _, text in ordered) or self.message
+
+
+class Diagnostics:
+    """Publishes a node's report on ``/diagnostics`` every second of a steady clock."""
+
+    def __init__(
+        self, node: Node, report: Callable[[], Report], hardware_id: Callable[[], str] = str
+    ) -> None:
+        """report, hardware_id: called from the node's executor."""
+        self._node, self._report, self._hardware_id = node, report, hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # Simulated time may stand still; a state that nobody hears of is none.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PERIOD_S, self.publish, clock=steady)
+
+    def publish(self) -> None:
+        """Publish now."""
+        report = self._report()
+        _add_clock(self._node, report)
+        if defects := _defects[self._node.get_fully_qualified_name()]:
+            report.values["defects"] = defects
+            report.add(ERROR, f"{defects} defects of ours, see the log")
+        status = DiagnosticStatus(
+            level=report.level,
+            name=self._node.get_fully_qualified_name(),
+            message=report.text,
+            hardware_id=self._hardware_id(),
+            values=[KeyValue(key=key, value=str(value)) for key, value in report.values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
+
+def _add_clock(node: Node, report: Report) -> None:
+    clock = node.get_clock()
+    if clock.ros_time_is_active and clock.now().nanoseconds == 0:
+        report.add(WARN, "use_sim_time is set, but nobody publishes /clock: stamps are 0")
+
+
+def survive(node: Node, err: Exception) -> str:
+    """Count and log a defect of ours; return the line that says what to report."""
+    if os.environ.get(DEBUG):
+        raise err
+    _defects[node.get_fully_qualified_name()] += 1
+    line = defect(err)
+    node.get_logger().error(line, throttle_duration_sec=_COMPLAINT_PERIOD_S)
+    return line

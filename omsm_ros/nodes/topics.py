@@ -1,0 +1,97 @@
+"""How samples and calibrations travel: quality of service, and many messages taken at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, TypeAlias
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
+from rclpy.subscription import Subscription
+
+MessageInfo: TypeAlias = "dict[str, int]"
+
+SAMPLES_QOS = QoSProfile(
+    # Reliable, and deep enough for seconds of blocks: a loss must be a fault, not a policy.
+    reliability=ReliabilityPolicy.RELIABLE,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=2000,
+)
+LATCHED_QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+)
+# Requests wait for their turn while a node computes; ten, the usual depth, are soon lost.
+REQUESTS_QOS = QoSProfile(depth=1000)
+
+# At most so many messages are taken in a row, so that timers and services have their turn.
+_BULK = 500
+
+
+def publish_on(
+    node: Node, undo: ExitStack, kind: Any, topic: str, qos: QoSProfile = SAMPLES_QOS
+) -> Publisher:
+    """Return a publisher, which ends with ``undo``; parameters qos_overrides.* are honoured."""
+    made = node.create_publisher(kind, topic, qos, qos_overriding_options=_overriding())
+    undo.callback(node.destroy_publisher, made)
+    return made
+
+
+def listen(
+    node: Node,
+    undo: ExitStack,
+    kind: Any,
+    topic: str,
+    callback: Callable[[Any, MessageInfo], None],
+    qos: QoSProfile = SAMPLES_QOS,
+    *,
+    raw: bool = False,
+    lost: Callable[[int], None] | None = None,
+) -> Subscription:
+    """Call ``callback(message, info)`` for each message, until ``undo``.
+
+    lost: called with the number of messages in all that were lost on their way
+    One round of the executor costs more than a message of one sample, so all that have come are
+    taken in one.
+    """
+
+    def take_all(message: Any, info: MessageInfo) -> None:
+        callback(message, info)
+        take_waiting(made, callback)
+
+    events = SubscriptionEventCallbacks(
+        message_lost=None if lost is None else lambda event: lost(event.total_count)
+    )
+    made = node.create_subscription(
+        kind,
+        topic,
+        take_all,
+        qos,
+        raw=raw,
+        event_callbacks=events,
+        qos_overriding_options=_overriding(),
+    )
+    undo.callback(node.destroy_subscription, made)
+    return made
+
+
+def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInfo], None]) -> int:
+    """Call ``callback`` for messages that wait, some hundreds at most; return how many."""
+    for count in range(_BULK):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return count
+        callback(*taken)
+    return _BULK
+
+
+def _overriding() -> QoSOverridingOptions:
+    kinds = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+    return QoSOverridingOptions((*kinds, QoSPolicyKind.DURABILITY))

@@ -1,0 +1,156 @@
+"""Every node is managed: its stages, its parameters, its end, as ``ros2`` sees them."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from omsm_msgs.srv import LoadCalibration
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+
+from omsm_ros.storage.calibration_file import save_calibration
+
+pytestmark = pytest.mark.timeout(120)
+
+UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
+# One node of each kind: with a device, with requests, with both streams.
+NODES = {"confocal_driver": {}, "calibrator": {}, "corrector": {}}
+
+
+def change(cell, node, transition):
+    asked = Transition(id=transition)
+    return cell.call(ChangeState, f"{node}/change_state", transition=asked).success
+
+
+def stage(cell, node):
+    return cell.call(GetState, f"{node}/get_state").current_state.label
+
+
+def put(cell, node, name, value):
+    kinds = {bool: "bool", int: "integer", float: "double", str: "string"}
+    kind = kinds[type(value)]
+    given = ParameterValue(
+        type=getattr(ParameterType, f"PARAMETER_{kind.upper()}"), **{f"{kind}_value": value}
+    )
+    asked = [Parameter(name=name, value=given)]
+    return cell.call(SetParameters, f"{node}/set_parameters", parameters=asked).results[0]
+
+
+def test_a_node_is_taken_through_its_stages_and_back(cell):
+    cell.processes.start("calibrator", output=str(cell.folder / "cal.json"), autostart=False)
+    assert stage(cell, "calibrator") == UNCONFIGURED
+    assert not change(cell, "calibrator", Transition.TRANSITION_ACTIVATE)  # refused, not raised
+    for transition, reached in (
+        (Transition.TRANSITION_CONFIGURE, INACTIVE),
+        (Transition.TRANSITION_ACTIVATE, ACTIVE),
+        (Transition.TRANSITION_DEACTIVATE, INACTIVE),
+        (Transition.TRANSITION_ACTIVATE, ACTIVE),
+        (Transition.TRANSITION_DEACTIVATE, INACTIVE),
+        (Transition.TRANSITION_CLEANUP, UNCONFIGURED),
+        (Transition.TRANSITION_CONFIGURE, INACTIVE),
+        (Transition.TRANSITION_ACTIVATE, ACTIVE),
+    ):
+        assert change(cell, "calibrator", transition)
+        assert stage(cell, "calibrator") == reached
+    cell.wait("its word", lambda: cell.operator.text("calibrator", "lifecycle") == ACTIVE)
+    assert cell.operator.value("calibrator", "defects") == 0
+
+
+def test_a_node_that_is_shut_down_ends_well(cell):
+    cell.processes.start("corrector")
+    assert change(cell, "corrector", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert cell.processes._running["corrector"].wait(20) == 0
+
+
+def test_a_parameter_acts_or_is_refused_with_the_reason(cell, true_calibration):
+    """Out of range: never. In force: refused, and how it is done instead. Unconfigured: it acts."""
+    path = cell.folder / "cal.json"
+    save_calibration(path, true_calibration)
+    cell.processes.start("corrector", calibration=str(path))
+    for name, value, named in (
+        ("polarity", 999, "999"),
+        ("polarity", -1, "deactivate and cleanup"),
+        ("geometry.centre_x", 1e6, "10"),
+        ("lateral_lag", float("nan"), "lateral_lag"),
+        ("calibration", "/etc/passwd", "deactivate and cleanup"),
+        ("autostart", False, "read"),
+    ):
+        answer = put(cell, "corrector", name, value)
+        assert not answer.successful
+        assert named in answer.reason
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+        assert change(cell, "corrector", transition)
+    assert not put(cell, "corrector", "polarity", 999).successful
+    assert put(cell, "corrector", "calibration_folders", "/nowhere").successful
+    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        assert change(cell, "corrector", transition)
+    answer = cell.call(LoadCalibration, "corrector/load_calibration", path=str(path))
+    assert not answer.success
+    assert "outside the folders" in answer.message
+
+
+def test_parameters_tell_their_meaning_and_range(cell):
+    cell.start_driver(port="/dev/null")
+    asked = ["block_size", "sample_period", "z.counts_per_unit", "device"]
+    found = cell.call(DescribeParameters, "confocal_driver/describe_parameters", names=asked)
+    block_size, period, scale, device = found.descriptors
+    assert (block_size.integer_range[0].from_value, block_size.integer_range[0].to_value) == (
+        1,
+        4_000_000,
+    )
+    assert period.floating_point_range[0].to_value == 10.0
+    assert "[s]" in period.description
+    assert "counts per m" in scale.description
+    assert "chrocodile" in device.description
+
+
+def start(node, *arguments):
+    command = [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "named"),
+    [
+        ("corrector", ["-p", "polarty:=-1"], "did you mean 'polarity'"),
+        ("corrector", ["-p", "qos_overrides./x.publisher.depth:=5"], "qos_overrides./x"),
+        ("corrector", ["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
+        ("confocal_driver", ["-p", "block_size:=-7", "-p", "port:=/dev/null"], "block_size"),
+        ("confocal_driver", ["-p", "device:=ruler", "-p", "port:=/dev/null"], "ruler"),
+        ("confocal_driver", [], "'port'"),
+        ("confocal_driver", ["-p", "port:=/dev/null"], "'x.counts_per_unit' is not stated"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line_and_exit_2(node, arguments, named):
+    done = start(node, *arguments)
+    assert done.returncode == 2, done.stderr
+    assert named in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("node", ["cell_emulator", "confocal_driver", "calibrator", "corrector"])
+def test_two_interrupts_end_a_node_well(node, tmp_path):
+    """As ``ros2 launch`` sends them: exit code 0 and no traceback, wherever the second falls."""
+    given = {
+        "cell_emulator": ["-p", f"link:={tmp_path / 'port'}"],
+        "confocal_driver": ["-p", "port:=/dev/null"]
+        + [w for a in "xyzbc" for w in ("-p", f"{a}.counts_per_unit:=1.0e10")],
+        "calibrator": ["-p", f"output:={tmp_path / 'cal.json'}"],
+        "corrector": [],
+    }[node]
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *given],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(4.0)
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
