@@ -30,7 +30,7 @@ WORDS = {
     "omsm_ros.cli.forming": ("form",),
     "omsm_ros.cli.identifying": ("identify", "validate"),
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
-    "omsm_ros.cli.starting": ("doctor",),
+    "omsm_ros.cli.starting": ("twin", "doctor"),
     "omsm_ros.cli.importing": ("import",),
     "omsm_ros.cli.campaigning": ("batch",),
     "omsm_ros.cli.remembering": ("history",),
@@ -46,6 +46,7 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
 
   is this computer ready?       omsm doctor
   see it all on a twin          omsm demo --out out/demo
+  bags to try things out        omsm twin --out trial/
   on a machine, plan a test     omsm plan steps --out plan/
   what is in a recording?       omsm inspect steps.mcap
   identify the dynamics         omsm identify steps.mcap --out cal.json --report certificate/

@@ -1,4 +1,4 @@
-"""The first command on a new computer: doctor."""
+"""The first commands on a new computer: doctor, and twin, to have something to work on."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts
 from omsm_ros.jobs.examine_host import DOUBTFUL, FAULTY, FINE, examine_host
+from omsm_ros.jobs.record_twin import record_twin
+from omsm_ros.twin.scenario import Scenario
 
 _MARKS = {FINE: "ok", DOUBTFUL: "??", FAULTY: "NO"}
 
@@ -33,7 +37,54 @@ def _faulty(facts: Facts) -> str:
     return f"not ready: {', '.join(names)}; each has its remedy above" if names else ""
 
 
+def _declare_twin(sub: argparse.ArgumentParser) -> None:
+    usual = Scenario()
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument(
+        "--radius",
+        type=number(quantities.RADIUS),
+        default=2e-3,
+        help="where the spiral starts [m]; 0.002 takes 40 s of scanning, the whole mirror 0.0127",
+    )
+    sub.add_argument(
+        "--rpm", type=number(quantities.SPEED), default=usual.spindle_speed, help="of the spindle"
+    )
+    sub.add_argument(
+        "--feed", type=number(quantities.RADIUS), default=usual.feed_per_turn, help="[m] a turn"
+    )
+    sub.add_argument("--disturbances", type=Path, metavar="FILE", help="what is wrong with it")
+    sub.add_argument("--seed", type=number(quantities.SEED), default=1, help="of noise and part")
+    sub.add_argument(
+        "--part",
+        type=number(quantities.SEED),
+        help="seed of the part alone: one part, two scans",
+    )
+
+
+def _twin(args: argparse.Namespace) -> Facts:
+    scenario = Scenario(
+        seed=args.seed,
+        spindle_speed=args.rpm,
+        feed_per_turn=args.feed,
+        start_radius=args.radius,
+        part_seed=args.part,
+    )
+    return asdict(record_twin(args.out, scenario, args.disturbances))
+
+
+def _show_twin(facts: Facts) -> None:
+    print(f"{facts['steps']}: {facts['step_samples']} samples of a step test on a flat")
+    print(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
+
+
 COMMANDS = [
+    Command(
+        "twin",
+        "bags of the digital twin: a step test and a scan to work on",
+        _declare_twin,
+        _twin,
+        _show_twin,
+    ),
     Command(
         "doctor",
         "is this computer ready to run a cell? What to do where it is not",

@@ -9,7 +9,7 @@ def test_omsm_alone_tells_what_to_do_next(capsys):
     assert cli.main([]) == 0
     told = capsys.readouterr().out
     words = [line.split("omsm ")[1].split()[0] for line in told.splitlines() if "  omsm " in line]
-    assert words == ["doctor", "demo", "plan", "inspect", "identify", "predict", "correct"]
+    assert words == ["doctor", "demo", "twin", "plan", "inspect", "identify", "predict", "correct"]
 
 
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
@@ -23,3 +23,21 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
     assert cli.main(["doctor", "--json"]) == 2
     told = json.loads(capsys.readouterr().out)
     assert [check["state"] for check in told["checks"]] == ["fine", "faulty"]
+
+
+def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
+    command = ["twin", "--out", str(tmp_path), "--radius", "5e-4", "--rpm", "60", "--json"]
+    assert cli.main(command) == 0
+    facts = json.loads(capsys.readouterr().out)
+    # Five turns of 0.1 mm at 60 rpm and 1 kHz.
+    assert facts["scan_samples"] == 5000
+    assert cli.main(["identify", facts["steps"], "--out", str(tmp_path / "cal.json")]) == 0
+    arguments = ["--calibration", str(tmp_path / "cal.json"), "--nominal", facts["nominal"]]
+    arguments += ["--out", str(tmp_path / "r"), "--no-report", "--json"]
+    capsys.readouterr()
+    assert cli.main(["correct", facts["scan"], *arguments]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    # The part's own figure and the probe's noise: tens of nanometres, where micrometres were.
+    assert summary["deviation"]["corrected"]["rms_area_weighted"] < 40e-9
+    assert cli.main(command) == 2
+    assert "exists" in capsys.readouterr().err

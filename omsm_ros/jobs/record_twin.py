@@ -1,0 +1,58 @@
+"""Bags of the digital twin: a step test and a scan, to learn on and to try things out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.storage import bags
+from omsm_ros.storage.disturbance_file import load_disturbances
+from omsm_ros.storage.files import save_text
+from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.twin.cell import Recording, blocks_of
+from omsm_ros.twin.disturbances import NOTHING
+from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+
+STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class TwinBags:
+    """Where the recordings lie, and how many samples each has."""
+
+    steps: str
+    scan: str
+    nominal: str
+    step_samples: int
+    scan_samples: int
+
+
+def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = None) -> TwinBags:
+    """Write ``steps.mcap``, ``scan.mcap`` and the nominal ``mirror.yaml`` into ``out``.
+
+    Raises BagError where a bag of that name is there already.
+    """
+    wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
+    steps = _write(out / STEPS, step_test_of(scenario, wrong))
+    scan = _write(out / SCAN, scan_of(scenario, wrong))
+    nominal = {
+        "shape": "off_axis_paraboloid",
+        "parent_focal_length": PAPER_MIRROR.parent_focal_length,
+        "off_axis_distance": PAPER_MIRROR.off_axis_distance,
+    }
+    save_text(out / NOMINAL, yaml.safe_dump(nominal, sort_keys=False))
+    return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+
+
+def _write(path: Path, recording: Recording) -> int:
+    """Write a recording as a bag; return its samples."""
+    samples = 0
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in blocks_of(recording):
+            bag.write_axes(axes)
+            bag.write_distance(distance)
+            samples += len(axes)
+    return samples
