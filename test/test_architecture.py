@@ -249,6 +249,12 @@ def test_a_file_is_read_in_one_sitting(path):
     assert path.stem not in {"utils", "util", "misc", "helpers", "common"}, "of what?"
 
 
+@pytest.mark.parametrize("path", sorted(Path(__file__).parent.rglob("*.py")), ids=lambda p: p.name)
+def test_a_test_is_read_in_one_sitting(path):
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= GREATEST_FILE, "split it by subject; what several share goes beside them"
+
+
 # --------------------------------------------------------------- a rule broken is a rule told
 
 BROKEN = [

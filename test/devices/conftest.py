@@ -49,6 +49,19 @@ class Bench:
         self.blocks += self.device.close()
         self._connected = False
 
+    def is_back_within_five_seconds_of(
+        self, strike: Callable[[Instrument], None], lasts: float
+    ) -> None:
+        """Let a fault ``strike`` that ``lasts`` [s], and hold that all samples come after it."""
+        self.run(1.0)
+        strike(self.instrument)
+        self.run(lasts + 5.0)
+        before = self.delivered
+        self.run(1.0)
+        assert self.delivered >= before + 900
+        self.end()
+        self.check()
+
     @property
     def delivered(self) -> int:
         return self.device.statistics.delivered

@@ -151,15 +151,7 @@ FAULTS: dict[str, Callable[[Instrument], None]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_it_is_back_within_five_seconds(cell: Any, fault: str) -> None:
     run = cell()
-    run.run(1.0)
-    FAULTS[fault](run.instrument)
-    run.run(2.0 if "long" not in fault else 6.0)
-    run.run(5.0)
-    before = run.delivered
-    run.run(1.0)
-    assert run.delivered >= before + 900
-    run.end()
-    run.check()
+    run.is_back_within_five_seconds_of(FAULTS[fault], 6.0 if "long" in fault else 2.0)
     restarted = fault in ("power cycle", "restart with the line up", "counter reset")
     assert run.device.statistics.restarts == restarted
 

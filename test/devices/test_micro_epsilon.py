@@ -71,15 +71,7 @@ def test_every_sample_arrives_once_with_its_counter(bench: Any, portion: int) ->
 @pytest.mark.parametrize("fault", FAULTS)
 def test_it_is_back_within_five_seconds(bench: Any, fault: str) -> None:
     run = ethernet(bench)
-    run.run(1.0)
-    FAULTS[fault](run.instrument)
-    run.run(2.0 if "long" not in fault else 6.0)
-    run.run(5.0)
-    before = run.delivered
-    run.run(1.0)
-    assert run.delivered >= before + 900
-    run.end()
-    run.check()
+    run.is_back_within_five_seconds_of(FAULTS[fault], 6.0 if "long" in fault else 2.0)
     found = run.device.statistics
     assert (found.duplicates > 0) == (fault == "doubled")
     if fault in ("lost", "cut", "unplug", "stall", "long stall"):

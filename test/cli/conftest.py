@@ -1,0 +1,12 @@
+"""The true calibration as a file."""
+
+import pytest
+
+from omsm_ros.storage import calibration_file
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory, true_calibration):
+    path = tmp_path_factory.mktemp("calibration") / "cal.json"
+    calibration_file.save_calibration(path, true_calibration)
+    return path

@@ -1,0 +1,51 @@
+"""One identification of the twin, drawn once."""
+
+from __future__ import annotations
+
+import pytest
+
+from omsm_ros.core.identification.fitted_record import fitted_record
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.report.certificate.page import (
+    CertificatePage,
+    certificate_figures_of,
+    render,
+)
+
+from .certificates import Page
+
+
+@pytest.fixture(scope="module")
+def record(step_test):
+    return assemble([step_test.axes], [step_test.distance])
+
+
+@pytest.fixture(scope="module")
+def identified(record):
+    return identify(record, order=2, settings={"fixture": "plate <3>"})
+
+
+@pytest.fixture(scope="module")
+def calibration(identified):
+    return identified.calibration
+
+
+@pytest.fixture(scope="module")
+def fitted(identified):
+    return fitted_record(identified)
+
+
+@pytest.fixture(scope="module")
+def figures(calibration, fitted):
+    return certificate_figures_of(calibration, fitted)
+
+
+@pytest.fixture(scope="module")
+def certificate(calibration, figures):
+    return CertificatePage(calibration, "2025-01-31 12:00 UTC", "steps.mcap", "0.1.0", figures)
+
+
+@pytest.fixture(scope="module")
+def page(certificate):
+    return Page(render(certificate))
