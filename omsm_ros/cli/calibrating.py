@@ -1,9 +1,10 @@
-"""Commands around a calibration: plan, verify, compare."""
+"""Commands around a calibration: plan, verify, compare, calset."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,13 +13,16 @@ import numpy as np
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.core.dynamics.calibration import verdict_of
+from omsm_ros.core.dynamics.calibration_set import calibration_set
 from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability
+from omsm_ros.errors import CalibrationError
 from omsm_ros.jobs.verify_calibration import path_check_of
 from omsm_ros.readable import quantity
-from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.calibration_file import load_calibration, save_calibration
 from omsm_ros.storage.files import save_text
 from omsm_ros.units import DEGREE_RAD
 
@@ -159,6 +163,65 @@ def _show_plan(facts: Facts) -> None:
     )
 
 
+# -------------------------------------------------------------------------------- calset
+
+_PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
+
+
+def _placed(text: str) -> tuple[Path, str, float]:
+    """Argument type: CAL.json@x=0.01, a calibration and its place."""
+    found = _PLACED.fullmatch(text)
+    if found is None:
+        raise argparse.ArgumentTypeError(
+            f"{quantities.shown(text)} has no place, expected such as CAL.json@x=0.01 (x, z or b)"
+        )
+    kind = quantities.ANGLE if found["axis"] == "b" else quantities.POSITION
+    return Path(found["path"]), found["axis"], number(kind)(found["position"])
+
+
+def _declare_calset(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "placed", type=_placed, nargs="+", metavar="CAL.json@x=POSITION",
+        help="calibrations and where they were made: x or z in metres, b in radians",
+    )  # fmt: skip
+    sub.add_argument("--out", type=Path, required=True, metavar="SET.json")
+
+
+def _calset(args: argparse.Namespace) -> Facts:
+    axes = sorted({axis for _, axis, _ in args.placed})
+    if len(axes) > 1:
+        raise CalibrationError(f"a set along {' and '.join(axes)}, expected one axis; make two")
+    placed = [(position, load_calibration(path)) for path, _, position in args.placed]
+    made = calibration_set(axes[0], placed)
+    verdict, reasons = verdict_of(made)
+    path = kept_at(args.out, verdict)
+    save_calibration(path, made)
+    return {
+        "along": made.along,
+        "positions": list(made.positions),
+        "lags": [member.dynamics.low_frequency_delay for member in made.members],
+        "valid_up_to": made.valid_up_to,
+        "verdict": verdict,
+        "reasons": reasons,
+        "calibration": str(path),
+    }
+
+
+def _show_calset(facts: Facts) -> None:
+    unit = "rad" if facts["along"] == "b" else "m"
+    table(
+        [
+            *(
+                (f"at {facts['along']} = {quantity(place, unit)}", f"lag {quantity(lag, 's', 4)}")
+                for place, lag in zip(facts["positions"], facts["lags"], strict=True)
+            ),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+            ("verdict", facts["verdict"] or "none"),
+            ("written to", facts["calibration"]),
+        ]
+    )
+
+
 COMMANDS = (
     Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
     Command(
@@ -174,5 +237,13 @@ COMMANDS = (
         _declare_compare,
         _compare,
         lambda facts: print(facts["text"]),
+    ),
+    Command(
+        "calset",
+        "calibrations along X, Z or B as one, for dynamics that vary",
+        _declare_calset,
+        _calset,
+        _show_calset,
+        rejected,
     ),
 )

@@ -29,7 +29,7 @@ WORDS = {
     "omsm_ros.cli.aligning": ("align",),
     "omsm_ros.cli.forming": ("form",),
     "omsm_ros.cli.identifying": ("identify", "validate"),
-    "omsm_ros.cli.calibrating": ("plan", "verify", "compare"),
+    "omsm_ros.cli.calibrating": ("plan", "verify", "compare", "calset"),
     "omsm_ros.cli.starting": ("twin", "doctor"),
     "omsm_ros.cli.importing": ("import",),
     "omsm_ros.cli.campaigning": ("batch",),

@@ -87,6 +87,11 @@ class Judgement:
 
 
 def _losses(done: Correction) -> Iterator[Reason]:
+    if beyond := done.account["axes"]["counted"].get("beyond"):
+        yield Reason(
+            f"{beyond} samples lie beyond the range of the calibration set",
+            "calibrate there too, and make the set anew with 'omsm calset'",
+        )
     for name, stream in done.account.items():
         lost = stream["received"] - stream["corrected"]
         if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:

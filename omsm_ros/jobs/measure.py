@@ -15,6 +15,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of
@@ -86,6 +87,7 @@ def summarise(
         "schema": "omsm-summary/1",
         "bag": str(bag),
         "calibration": calibration.id,
+        **_places(calibration),
         "samples": done.account,
         "uncertainty_budget": done.budget,
         "stamp_skew": done.stamp_skew,
@@ -107,6 +109,14 @@ def summarise(
     summary["warnings"] += judged.pop("warnings")
     audited = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, audited)
+
+
+def _places(calibration: Calibration) -> dict[str, Any]:
+    """Where the members of a calibration set were made."""
+    if not isinstance(calibration, CalibrationSet):
+        return {}
+    places = {"along": calibration.along, "positions": list(calibration.positions)}
+    return {"calibration_set": places}
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+from omsm_ros.core.dynamics import plausibility
 from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration, content_id
+from omsm_ros.core.dynamics.calibration_set import (
+    AXES,
+    MOST_MEMBERS,
+    SET_SCHEMA,
+    set_from_content,
+)
 from omsm_ros.errors import CalibrationError
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.files import read_text, save_json
@@ -29,24 +37,52 @@ _PROPERTIES = {
 _FORM = form(_PROPERTIES, tuple(_PROPERTIES))
 
 
+_MEMBER = form({"position": NUMBER, "calibration": _FORM}, ("position", "calibration"))
+_SET_PROPERTIES = {
+    "schema": {"const": SET_SCHEMA},
+    "id": _PROPERTIES["id"],
+    "along": {"enum": list(AXES)},
+    "members": {"type": "array", "items": _MEMBER, "maxItems": MOST_MEMBERS},
+    "certificate": {"type": "object"},
+}
+_SET_FORM = form(_SET_PROPERTIES, tuple(_SET_PROPERTIES))
+
+
 def save_calibration(path: Path | str, calibration: Calibration) -> None:
-    """Write ``CAL.json`` (schema "omsm-calibration/1")."""
+    """Write ``CAL.json`` (schema "omsm-calibration/1"), or a set of them."""
     save_json(path, {"id": calibration.id, **calibration.content()})
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read ``CAL.json``; CalibrationError if it is malformed, altered or not plausible."""
+    """Read ``CAL.json``, or a set of them; CalibrationError if malformed, altered, implausible."""
     text = read_text(path, MAX_CALIBRATION_BYTES, CalibrationError, "calibration")
     what = f"calibration {str(path)!r}"
     content = strict_json.object_of(text, CalibrationError, what)
-    check_form(content, _FORM, CalibrationError, what)
+    is_set = content.get("schema") == SET_SCHEMA
+    check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
+    try:
+        return _set_of(content) if is_set else _calibration_of(content)
+    except CalibrationError as err:
+        raise CalibrationError(f"{what}: {err}") from err
+
+
+def _calibration_of(content: dict[str, Any]) -> Calibration:
+    _check_id(content)
+    return Calibration.from_content(content)
+
+
+def _set_of(content: dict[str, Any]) -> Calibration:
+    _check_id(content)
+    plausibility.check_certificate(content["certificate"])
+    members = [_calibration_of(dict(member["calibration"])) for member in content["members"]]
+    return set_from_content(content, members)
+
+
+def _check_id(content: dict[str, Any]) -> None:
+    """Take the id away from ``content``, and raise CalibrationError if it is not its own."""
     stored = content.pop("id")
     if stored != content_id(content):
         raise CalibrationError(
-            f"{what} was altered after it was made: id {stored!r} does not match its "
-            f"content {content_id(content)!r}; identify it again"
+            f"it was altered after it was made: id {stored!r} does not match its content "
+            f"{content_id(content)!r}; identify it again"
         )
-    try:
-        return Calibration.from_content(content)
-    except CalibrationError as err:
-        raise CalibrationError(f"{what}: {err}") from err

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.correction.motion_filter import MOVED, RATE, MotionFilter, MotionFilters
+from omsm_ros.core.correction.motion_filter import MOVED, RATE, Blend, MotionFilter, MotionFilters
 from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.surface_height import Surface
@@ -197,13 +198,13 @@ class Corrector:
                 f"{expected!r} s; identify at this rate or accept another rate explicitly"
             )
         self._period = period
-        filters = MotionFilters.of(
-            self._calibration,
-            period,
-            lateral_lag(self._calibration, self._options),
-        )
-        self._noise_gain = filters.height.noise_gain
-        return MotionFilter(filters)
+        known = self._calibration
+        lag = lateral_lag(known, self._options)
+        members = known.members if isinstance(known, CalibrationSet) else (known,)
+        filters = [MotionFilters.of(member, period, lag) for member in members]
+        self._noise_gain = max(each.height.noise_gain for each in filters)
+        blend = Blend(known) if isinstance(known, CalibrationSet) else None
+        return MotionFilter(*filters, blend=blend)
 
     def _join(self) -> None:
         for axes, distance in self._pairing.pairs():

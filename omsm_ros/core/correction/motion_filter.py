@@ -7,7 +7,7 @@ no number. The samples in which a wrong start would still be felt are marked as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.polynomial import polynomial
 
 from omsm_ros.core.correction.uncertainty import derivative_filter, past_of, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
@@ -101,22 +102,79 @@ def forgotten_after(dynamics: TransferFunction, sample_period: float) -> int:
     )
 
 
+class _Bank:
+    """The filters of one calibration, running."""
+
+    def __init__(self, filters: MotionFilters) -> None:
+        self._height = Recursion(filters.height)
+        self._rate = Recursion(filters.rate)
+        self._dynamics = [Recursion(f) for f in filters.dynamics]
+        self._past = filters.past
+
+    def start(self, z: FloatArray) -> None:
+        motion = past_motion(z.copy())
+        self._height.start(motion)
+        self._rate.start(motion)
+        for recursion in self._dynamics:
+            recursion.start(self._past(z.copy()))
+
+    def run(self, z: FloatArray) -> FloatArray:
+        """Return H(z), its rate and its sensitivities, (2 + r, n)."""
+        return np.stack([r.run(z) for r in (self._height, self._rate, *self._dynamics)])
+
+    @property
+    def outputs(self) -> int:
+        return 2 + len(self._dynamics)
+
+
+class Blend:
+    """The places of several calibrations along one of the axes x, y, z, b, c.
+
+    Each member's filter runs over the whole stream, and their *outputs* are mixed by weights that
+    are continuous in position: no filter is ever switched, started or given coefficients that do
+    not belong to its state, so nothing bumps.
+    """
+
+    def __init__(self, places: CalibrationSet) -> None:
+        self._places = places
+        self._axis = {"x": _X, "z": _Z, "b": _B}[places.along]
+
+    def mixed(self, axes: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
+        """Return H(z), its rate and its sensitivities of all, (2 + r, n).
+
+        What is uncertain of one member may be of all alike: their variances are mixed, not the
+        squares of their weights. Between two members a and b the response may go from one to the
+        other in any way: a uniform distribution about the mean there, ``√(w(1-w)/3) (H_a - H_b)``.
+        """
+        weights = self._places.weights(axes[self._axis])
+        moved = np.sum([w * out[:2] for w, out in zip(weights, outputs, strict=True)], axis=0)
+        rows = [np.sqrt(w) * out[2:] for w, out in zip(weights, outputs, strict=True)]
+        between = [
+            np.sqrt(weights[k] * weights[k + 1] / 3) * (outputs[k][0] - outputs[k + 1][0])
+            for k in range(len(outputs) - 1)
+        ]
+        return np.concatenate([moved, *rows, between])
+
+    def beyond(self, axes: FloatArray) -> BoolArray:
+        """Return where no member knows the dynamics (n,)."""
+        return ~self._places.covered(axes[self._axis])
+
+
 class MotionFilter:
     """Turns runs of axis channels x, y, z, b, c into runs of
 
     x, y, b, c, z - H(z), H(z), the rate of H(z), and the changes of H(z) per standard
     uncertainty of each direction of the calibration's covariance.
+
+    filters: of one calibration, or of each member of the set that ``blend`` mixes
     """
 
-    def __init__(self, filters: MotionFilters) -> None:
-        self._height = Recursion(filters.height)
-        self._dynamics = [Recursion(f) for f in filters.dynamics]
-        self._past = filters.past
-        self._rate = Recursion(filters.rate)
-        self._lateral = (
-            {axis: Recursion(filters.lateral) for axis in _LATERAL} if filters.lateral else {}
-        )
-        settling = filters.settling_samples()
+    def __init__(self, *filters: MotionFilters, blend: Blend | None = None) -> None:
+        self._banks = [_Bank(each) for each in filters]
+        self._blend = blend
+        lateral = filters[0].lateral
+        self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
+        settling = max(each.settling_samples() for each in filters)
         self._start_samples = max(settling // 2, _MIN_START_SAMPLES)
         self._settling = max(settling, self._start_samples)
         self._unsettled = self._settling
@@ -165,33 +223,31 @@ class MotionFilter:
         return [self._filtered(w) for w in waiting]
 
     def _start(self, first: FloatArray) -> None:
-        motion = past_motion(first[_Z].copy())
-        for recursion in (self._height, self._rate):
-            recursion.start(motion)
-        for recursion in self._dynamics:
-            recursion.start(self._past(first[_Z].copy()))
+        for bank in self._banks:
+            bank.start(first[_Z])
         for axis, recursion in self._lateral.items():
             recursion.start(past_motion(first[axis].copy()))
 
     def _filtered(self, run: Run) -> Run:
-        z = run.values[_Z]
-        out = np.empty((self._outputs, len(run)))
+        outputs = [bank.run(run.values[_Z]) for bank in self._banks]
+        moved = self._blend.mixed(run.values, outputs) if self._blend else outputs[0]
+        out = np.empty((MOVED + len(moved), len(run)))
         for row, axis in enumerate(_LATERAL):
             samples = run.values[axis]
             out[row] = self._lateral[axis].run(samples) if self._lateral else samples
-        out[MOVED] = self._height.run(z)
-        out[ERROR] = z - out[MOVED]
-        out[RATE] = self._rate.run(z)
-        for row, recursion in enumerate(self._dynamics, SENSITIVITIES):
-            out[row] = recursion.run(z)
+        out[ERROR] = run.values[_Z] - moved[0]
+        out[MOVED:] = moved
         reasons = np.zeros(len(run), np.uint8)
+        if self._blend:
+            reasons[self._blend.beyond(run.values)] = Reason.BEYOND
         reasons[: self._unsettled] = Reason.SETTLING
         self._unsettled = max(self._unsettled - len(run), 0)
         return Run(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
 
     @property
     def _outputs(self) -> int:
-        return SENSITIVITIES + len(self._dynamics)
+        between = len(self._banks) - 1
+        return SENSITIVITIES + between + sum(bank.outputs - 2 for bank in self._banks)
 
     def _unfiltered(self, run: Run, reason: Reason) -> Run:
         return Run(

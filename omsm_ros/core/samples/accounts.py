@@ -24,6 +24,7 @@ class Reason(IntEnum):
     LATE: came after later samples, into a gap that had been passed
     SETTLING: the filter had just started
     OVERDUE: waited for its partner, or for whom its partner waited, longer than is allowed
+    BEYOND: taken where no member of the calibration set knows the dynamics
     """
 
     NONE = 0
@@ -33,6 +34,7 @@ class Reason(IntEnum):
     LATE = 4
     SETTLING = 5
     OVERDUE = 6
+    BEYOND = 7
 
 
 @dataclass(frozen=True)
