@@ -14,8 +14,8 @@ import numpy as np
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
-from omsm_ros.core.dynamics.calibration_set import calibration_set
 from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from omsm_ros import __version__
+from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.core.dynamics import plausibility
-from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration, content_id
-from omsm_ros.core.dynamics.calibration_set import (
+from omsm_ros.core.correction.calibration_set import (
     AXES,
     MOST_MEMBERS,
     SET_SCHEMA,
     set_from_content,
 )
+from omsm_ros.core.dynamics import plausibility
+from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration, content_id
 from omsm_ros.errors import CalibrationError
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.files import read_text, save_json

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.motion_filter import MOVED, RATE, Blend, MotionFilter, MotionFilters
 from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
 from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.surface_height import Surface

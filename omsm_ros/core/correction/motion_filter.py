@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import polynomial
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.uncertainty import derivative_filter, past_of, sensitivity_filters
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.calibration_set import CalibrationSet
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction

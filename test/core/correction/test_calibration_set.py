@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet, calibration_set
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.calibration_set import CalibrationSet, calibration_set
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.trajectories import Spiral
