@@ -26,6 +26,11 @@ _DRIFT_SIGMA = 100 * PPM
 _NO_CRYSTAL = 1000 * PPM
 # Arrivals off the line by more than this, all to one side, for so long: a clock was set [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
+# Nothing arrives before it was sent: what is earlier than the line by more than a busy host may
+# have held up its first arrivals tells of a clock that was set, at once [s].
+_EARLY_S = 1.0
+# And no sample is kept back for longer than this before it is sent [s].
+_OLDEST_S = 3600.0
 # A drift is told from so many seconds of arrivals on.
 _TELLING_S = 5.0
 # Huber's constant: 95 % efficient for normal jitter; uniform jitter is not clipped at all.
@@ -37,7 +42,8 @@ _LEAST_SCALE_S = 1e-6
 class DeviceClock:
     """Stamps that neither jump nor bunch, and rise strictly whatever the arrivals do.
 
-    A clock that was set, the device's or the host's, is followed after two seconds.
+    A clock that was set, the device's or the host's, is followed after two seconds, and at once
+    if arrivals then come earlier than they can.
     """
 
     def __init__(self) -> None:
@@ -48,7 +54,7 @@ class DeviceClock:
         """Forget all arrivals: the device's clock started anew. Stamps still only rise."""
         # Bins: sums of device time and of delay after the origin [s], and how many.
         self._bins: deque[tuple[float, float, int]] = deque()
-        self._origin = (0, 0)
+        self._origin = self._newest = (0, 0)
         self._offset = self._slope = 0.0
         self._span = 0.0
         self._fitted_at = -np.inf
@@ -73,15 +79,22 @@ class DeviceClock:
             self.restart()
             self.observe(device_ns, arrival_ns)
             return
+        self._newest = (device_ns, arrival_ns)
         self._keep(device, late)
         if len(self._bins) < 50 or device - self._fitted_at > 0.1 or device < self._fitted_at:
             self._fit()
             self._fitted_at = device
 
     def to_host(self, device_ns: int) -> int:
-        """Host time [ns] of ``device_ns``, later than every stamp given before."""
+        """Host time [ns] of ``device_ns``, later than every stamp given before.
+
+        A time that no sample can have which arrived with the newest is not believed.
+        """
         if not self._bins:
             raise ConfigurationError("DeviceClock.to_host before any arrival; call observe() first")
+        age = (self._newest[0] - device_ns) * NANOSECOND_S
+        if not -_EARLY_S < age < _OLDEST_S:
+            device_ns = self._newest[0]
         since = device_ns - self._origin[0]
         late = self._offset + self._slope * (since * NANOSECOND_S)
         stamp = self._origin[1] + since + round(late * NANOSECONDS_PER_S)
@@ -102,8 +115,10 @@ class DeviceClock:
             self._bins.popleft()
 
     def _stepped(self, device: float, late: float) -> bool:
-        """Whether arrivals have been off the line, to one side, for too long."""
+        """Whether arrivals have been off the line, to one side, for too long or too far."""
         off = late - (self._offset + self._slope * device)
+        if self._bins and not -_EARLY_S < off < _OLDEST_S:
+            return True
         side, arrival = bool(off > 0), device + late
         if not self._bins or abs(off) < _STEP_S:
             self._astray = None

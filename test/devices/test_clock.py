@@ -151,3 +151,27 @@ def test_a_stall_of_the_host_moves_nothing() -> None:
 def test_misuse_is_named() -> None:
     with pytest.raises(ConfigurationError, match="observe"):
         DeviceClock().to_host(0)
+
+
+@pytest.mark.parametrize("first", [2**64 - 1, 2**63 - 1, -1, 0, 3 * 10**18])
+@pytest.mark.parametrize("uptime_s", [0, 10, 3 * 10**9])
+def test_a_first_time_that_is_wrong_does_not_last(first: int, uptime_s: int) -> None:
+    """As if the first frame had been sent before the device's clock was set."""
+    device, host, arrival = link(1000)
+    device = device + uptime_s * 10**9
+    clock = DeviceClock()
+    clock.observe(first, int(host[0]) - 5 * MS)
+    clock.to_host(first)
+    error = stamps_of(clock, device, arrival) - host
+    assert abs(error).max() <= 1000 * MS  # half a second of uptime could be the truth
+    if uptime_s:
+        assert abs(error).max() < 10 * MS
+
+
+def test_a_wrong_time_among_samples_that_arrive_together_is_not_believed() -> None:
+    clock = DeviceClock()
+    newest = 3 * 10**9 * 10**9
+    clock.observe(newest, EPOCH)
+    stamps = [clock.to_host(t) for t in (-1, newest - 2 * MS, 2**64 - 1)]
+    assert all(abs(stamp - EPOCH) <= 2 * MS for stamp in stamps)
+    assert clock.to_host(newest + 10 * MS) == EPOCH + 10 * MS

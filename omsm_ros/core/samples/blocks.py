@@ -116,6 +116,7 @@ class AxisBlock(Block):
 class DistanceBlock(Block):
     """Probe readings: distance [m] (n,), intensity 0-1 (n,) or (0,), status (n,) or (0,).
 
+    The distance is NaN where the status is not OK, whatever was given.
     An empty status means that every sample is OK, an empty intensity that the
     device does not tell.
     """
@@ -127,6 +128,10 @@ class DistanceBlock(Block):
     def __post_init__(self) -> None:
         optional = {len(a) for a in (self.intensity, self.status) if len(a)}
         self._check("DistanceBlock", {len(self.distance)} | optional, _DISTANCE)
+        if len(self.status) and np.any(self.status != Status.OK):
+            # As the message promises, whoever sent it: a reading that is not OK is none.
+            readings = np.where(self.status == Status.OK, self.distance, np.nan)
+            object.__setattr__(self, "distance", readings)
 
     def __len__(self) -> int:
         return len(self.distance)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, Status
 from omsm_ros.errors import DataError
 
 FIVE = np.zeros(5)
@@ -49,3 +49,18 @@ def test_a_reading_that_cannot_be_is_lost_and_costs_no_other() -> None:
     assert block.distance[0] == 1e-5
     assert np.isnan(block.distance[1:]).all()
     assert block.ok.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("status", [s for s in Status if s is not Status.OK] + [77])
+def test_a_reading_that_is_not_ok_is_none_whatever_was_sent(status: int) -> None:
+    sent = np.array([1e-6, 2e-6, 3e-6])
+    block = DistanceBlock(
+        stamp_ns=0,
+        first_sample=0,
+        sample_period=1e-3,
+        distance=sent,
+        status=np.array([Status.OK, status, Status.OK], np.uint8),
+    )
+    np.testing.assert_array_equal(block.distance, [1e-6, np.nan, 3e-6])
+    np.testing.assert_array_equal(block.ok, [True, False, True])
+    assert sent[1] == 2e-6  # not the sender's own array
