@@ -16,7 +16,14 @@ from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
-from omsm_ros.core.machine.step_plan import plan_csv, plan_gcode, plan_steps
+from omsm_ros.core.machine.step_plan import (
+    PLANNED_COUNT,
+    PLANNED_DWELL_S,
+    SECOND_SHARE,
+    plan_csv,
+    plan_gcode,
+    plan_steps,
+)
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability
 from omsm_ros.errors import CalibrationError
@@ -27,7 +34,6 @@ from omsm_ros.storage.files import save_text
 from omsm_ros.units import DEGREE_RAD
 
 # A second height that is no simple part of the first: 3 µm beside 9.8 µm.
-_SECOND_SHARE = 3 / 9.8
 
 # -------------------------------------------------------------------------------- verify
 
@@ -116,8 +122,13 @@ def _declare_plan(sub: argparse.ArgumentParser) -> None:
             None,
             "of every other step [m]; 3/9.8 of --step by default",
         ),
-        ("--count", quantities.COUNT, 10, "steps up; as many follow down"),
-        ("--dwell", quantities.DWELL, 0.5, "from edge to edge [s]"),
+        ("--count", quantities.COUNT, PLANNED_COUNT, "steps up and as many down, from the middle"),
+        (
+            "--dwell",
+            quantities.DWELL,
+            PLANNED_DWELL_S,
+            "from edge to edge [s]; four times as long leaves half as much creep unseen",
+        ),
         ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
         ("--half-range", quantities.STEP, 50e-6, "of the probe [m]"),
     ):
@@ -128,7 +139,7 @@ def _plan(args: argparse.Namespace) -> Facts:
     plan = plan_steps(
         sample_period=args.sample_period,
         step=args.step,
-        second_step=args.second_step or _SECOND_SHARE * args.step,
+        second_step=args.second_step or SECOND_SHARE * args.step,
         count=args.count,
         dwell=args.dwell,
         rise=args.rise,

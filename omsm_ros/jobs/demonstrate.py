@@ -39,7 +39,7 @@ from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
-from omsm_ros.twin.scenario import Scenario, scan_of, spiral_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
 from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.truth import TruthComparison, departure_from_truth
 from omsm_ros.units import PPM
@@ -101,7 +101,7 @@ class Demonstration:
     @property
     def step_test_samples(self) -> int:
         """Samples of the step test."""
-        return len(step_test_of(self.scenario, self.disturbances).axes)
+        return len(planned_test_of(self.scenario, self.disturbances).axes)
 
     @property
     def scan_samples(self) -> int:
@@ -175,7 +175,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     if view is None:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
-    step_test = step_test_of(plan.scenario, plan.disturbances)
+    step_test = planned_test_of(plan.scenario, plan.disturbances)
     summary = measurement.summarise(plan.bag, done, calibration, Judgement(options))
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}

@@ -18,7 +18,7 @@ from omsm_ros.parameters import Parameter
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.runtime_folder import runtime_folder
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
 _SCENARIO = (
     Parameter("seed", 1, "seed of all noise", quantities.SEED),
@@ -76,7 +76,7 @@ class CellEmulatorNode(ManagedNode):
         line = undo.enter_context(line_for(self._link))
         self._player = emulated(values["device"]).player(line, faults)
         undo.callback(self._player.close)
-        for name, motion_of in (("step_test", step_test_of), ("scan", scan_of)):
+        for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")

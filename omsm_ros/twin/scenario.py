@@ -6,6 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from omsm_ros.core.machine.step_plan import (
+    PLANNED_COUNT,
+    PLANNED_DWELL_S,
+    SECOND_SHARE,
+    plan_steps,
+)
 from omsm_ros.core.machine.trajectories import Motion, Spiral, StepTest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Recording, record
@@ -44,6 +50,20 @@ class Scenario:
 def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """The paper's step test on a fixed flat."""
     return on_a_flat(scenario, StepTest(rise=scenario.step_rise), disturbances)
+
+
+def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
+    """The step test that `omsm plan steps` makes, with rests half as long, on a fixed flat."""
+    step = StepTest().step
+    motion = plan_steps(
+        sample_period=scenario.sample_period,
+        step=step,
+        second_step=SECOND_SHARE * step,
+        count=PLANNED_COUNT,
+        dwell=PLANNED_DWELL_S / 2,
+        rise=scenario.step_rise,
+    )
+    return on_a_flat(scenario, motion, disturbances)
 
 
 def on_a_flat(

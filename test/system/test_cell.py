@@ -156,7 +156,7 @@ def test_corrector_without_calibration_counts_and_waits(cell, true_calibration):
         ),
     )
     assert cell.call(Trigger, "cell_emulator/step_test").success
-    cell.wait("samples", lambda: cell.operator.value("corrector", "axes_uncalibrated") == 10_500)
+    cell.wait("samples", lambda: cell.operator.value("corrector", "axes_uncalibrated") == 29_000)
     assert cell.operator.value("corrector", "clouds_published") == 0
     assert "no calibration" in cell.operator.text("corrector", "message")
 

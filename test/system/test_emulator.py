@@ -53,7 +53,7 @@ def test_the_file_of_disturbances_is_played(cell):
     cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)
     cell.wait("us", lambda: cell.operator.value("confocal_driver", "axes_subscribers") >= 1)
     assert cell.call(Trigger, "cell_emulator/step_test").success
-    cell.wait("all of it", lambda: sum(len(block.z) for block in blocks) >= 10_500)
+    cell.wait("all of it", lambda: sum(len(block.z) for block in blocks) >= 29_000)
     highest = max(max(block.z) for block in blocks)
     assert highest == pytest.approx(98e-6 * 1.01, abs=0.05e-6)
 

@@ -14,7 +14,12 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from omsm_ros.core.correction.calibration_set import CalibrationSet
-from omsm_ros.core.correction.uncertainty import derivative_filter, past_of, sensitivity_filters
+from omsm_ros.core.correction.uncertainty import (
+    derivative_filter,
+    past_of,
+    sensitivity_filters,
+    uncertain_parts,
+)
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
@@ -28,6 +33,7 @@ SETTLED = 1e-6
 _MIN_START_SAMPLES = 12
 _X, _Y, _Z, _B, _C = range(5)
 _LATERAL = (_X, _Y, _B, _C)
+Past = Callable[[FloatArray], FloatArray]
 # Rows of what comes out: x, y, b, c, z - H(z), H(z), rate of H(z); sensitivities follow.
 ERROR, MOVED, RATE, SENSITIVITIES = 4, 5, 6, 7
 
@@ -38,10 +44,11 @@ class MotionFilters:
 
     height: H on z;  rate: on z, the rate of H(z)
     dynamics: F_r on z, change of H(z) per standard uncertainty of each direction r of the
-        calibration's covariance
+        calibration's covariance: those of its noise, then those of what could hide
     lateral: on x, y, b, c, where the lag is latency; None where it is not
     forgotten: samples after which the poles of G have forgotten a wrong start
-    past: what the filters of ``dynamics`` take for the past of their first samples
+    hidden: how many of ``dynamics``, the last, are of what could hide
+    pasts: what each of ``dynamics`` takes for the past of its first samples
     """
 
     height: DigitalFilter
@@ -49,7 +56,8 @@ class MotionFilters:
     rate: DigitalFilter
     lateral: DigitalFilter | None
     forgotten: int = 2**31
-    past: Callable[[FloatArray], FloatArray] = past_motion
+    hidden: int = 0
+    pasts: tuple[Past, ...] = ()
 
     @classmethod
     def of(
@@ -63,13 +71,18 @@ class MotionFilters:
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator)
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
+        noise, hidden = (
+            [(f, past_of(part)) for f in sensitivity_filters(part, sample_period)]
+            for part in uncertain_parts(calibration)
+        )
         return cls(
             height=discretise(g, sample_period, order),
-            dynamics=sensitivity_filters(calibration, sample_period),
+            dynamics=[f for f, _ in noise + hidden],
             rate=derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles()),
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
             forgotten=forgotten_after(g, sample_period),
-            past=past_of(calibration),
+            hidden=len(hidden),
+            pasts=tuple(past for _, past in noise + hidden),
         )
 
     def settling_samples(self) -> int:
@@ -78,6 +91,13 @@ class MotionFilters:
         # A slow pole with a small share of the response is forgotten long before its decay ends.
         settled = min(settled, self.forgotten + 2 * len(self.height.sections))
         return max([settled, *([self.lateral.settling_samples(SETTLED)] if self.lateral else [])])
+
+
+def hidden_rows(filters: Sequence[MotionFilters]) -> BoolArray:
+    """Return which sensitivities of a :class:`MotionFilter` are of what could hide, (r,)."""
+    rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.hidden for f in filters]
+    # How members of a set differ is none of them.
+    return np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
 
 
 def forgotten_after(dynamics: TransferFunction, sample_period: float) -> int:
@@ -109,14 +129,14 @@ class _Bank:
         self._height = Recursion(filters.height)
         self._rate = Recursion(filters.rate)
         self._dynamics = [Recursion(f) for f in filters.dynamics]
-        self._past = filters.past
+        self._pasts = filters.pasts or (past_motion,) * len(filters.dynamics)
 
     def start(self, z: FloatArray) -> None:
         motion = past_motion(z.copy())
         self._height.start(motion)
         self._rate.start(motion)
-        for recursion in self._dynamics:
-            recursion.start(self._past(z.copy()))
+        for recursion, past in zip(self._dynamics, self._pasts, strict=True):
+            recursion.start(past(z.copy()))
 
     def run(self, z: FloatArray) -> FloatArray:
         """Return H(z), its rate and its sensitivities, (2 + r, n)."""

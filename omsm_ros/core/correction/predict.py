@@ -14,7 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.uncertainty import ErrorSources, past_of, sensitivity_filters
+from omsm_ros.core.correction.uncertainty import (
+    ErrorSources,
+    past_of,
+    sensitivity_filters,
+    uncertain_parts,
+)
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
 from omsm_ros.core.dynamics.discretisation_error import (
@@ -58,6 +63,7 @@ class Prediction:
 
     peak_to_valley, rms: of the dynamic error (1 - G) z without correction [m]
     residual: largest standard uncertainty that the correction leaves on the path [m], k = 1
+    residual_hidden: the part of it that the step test could not have shown [m], k = 1
     outside_band_fraction: share of the mean square velocity above the trusted band [1]
     speed_factor: how much faster the path may be run within all limits, at most 100;
         0 if it may not be run at any speed
@@ -69,6 +75,7 @@ class Prediction:
     peak_to_valley: float
     rms: float
     residual: float
+    residual_hidden: float
     outside_band_fraction: float
     speed_factor: float
     safe: bool
@@ -95,6 +102,7 @@ def predict_error(
     error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
     spread = float(np.ptp(error))
     dynamics, residual = _dynamics_limit(calibration, path, budget)
+    hidden = _hidden_at_worst(calibration, path)
     others, missing = speed_limits(path, limits or MachineLimits(), calibration.valid_up_to, budget)
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
@@ -102,13 +110,14 @@ def predict_error(
         peak_to_valley=spread,
         rms=float(np.std(error)),
         residual=residual,
+        residual_hidden=hidden,
         outside_band_fraction=_outside_fraction(calibration, path),
         speed_factor=binding.speed_factor,
         safe=binding.speed_factor >= 1,
         binding=binding.name,
         limits=every,
         not_evaluated=tuple(missing),
-        message=_message(calibration, spread, residual, budget, binding),
+        message=_message(calibration, spread, (residual, hidden), budget, binding),
     )
 
 
@@ -131,15 +140,36 @@ def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: f
     (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
     it at either, the motion above the band is taken to be as large as next to them.
     """
-    variance = np.full(len(z), ErrorSources.of(calibration).motion_error ** 2)
+    known, hidden = _residual_variances(calibration, z, sample_period)
+    return np.asarray(np.sqrt(known + hidden))
+
+
+def _residual_variances(
+    calibration: Calibration, z: FloatArray, sample_period: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variance of the residual [m²] but for what could hide, and that of it."""
+    noise, hidden = (_variance(part, z, sample_period) for part in uncertain_parts(calibration))
+    digital = discretise(calibration.dynamics, sample_period)
+    known = noise + ErrorSources.of(calibration).motion_error ** 2
+    known += _missed_beyond(calibration.valid_up_to, digital, z)
+    settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(z) // 4)
+    return known[settling:], hidden[settling:]
+
+
+def _variance(calibration: Calibration, z: FloatArray, sample_period: float) -> FloatArray:
+    """Return the variance of G z [m²] from the covariance of ``calibration``, (n,)."""
+    variance = np.zeros(len(z))
     for digital in sensitivity_filters(calibration, sample_period):
         recursion = Recursion(digital)
         recursion.start(past_of(calibration)(z[:_START_SAMPLES]))
         variance += recursion.run(z) ** 2
-    digital = discretise(calibration.dynamics, sample_period)
-    variance += _missed_beyond(calibration.valid_up_to, digital, z)
-    settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(variance) // 4)
-    return np.asarray(np.sqrt(variance[settling:]))
+    return variance
+
+
+def _hidden_at_worst(calibration: Calibration, path: ScanPath) -> float:
+    """Return what could hide, of the residual where that is largest [m]."""
+    known, hidden = _residual_variances(calibration, path.z, path.sample_period)
+    return float(np.sqrt(hidden[np.argmax(known + hidden)]))
 
 
 def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
@@ -237,31 +267,61 @@ def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
     return float(power[frequency > calibration.valid_up_to].sum()) / total if total > 0 else 0.0
 
 
+def _what_could_hide(calibration: Calibration, hidden: float) -> str:
+    """Name the part of the residual that the step test could not have shown."""
+    mostly = calibration.certificate.get("hidden_mostly")
+    if hidden == 0 or not isinstance(mostly, str):
+        return ""
+    return (
+        f"; {quantity(2 * hidden, 'm')} of it are what the step test could not have shown, "
+        f"mostly {mostly}"
+    )
+
+
+def _better_calibration(
+    calibration: Calibration, residuals: tuple[float, float], budget: float
+) -> str:
+    """Say which step test would leave less: what slow motion leaves open falls with its length.
+
+    The noise of a slow term falls with the square root of the test's duration, and so does
+    the largest relaxation that it would miss.
+    """
+    residual, hidden = residuals
+    plateau = calibration.certificate.get("plateau_s")
+    if type(plateau) is not float or not hidden**2 > 0.5 * residual**2:
+        return "calibrate better (longer plateaus and more steps, omsm plan steps)"
+    longer = plateau * (2 * residual / budget) ** 2
+    return f"calibrate with rests of {longer:.2g} s or more (omsm plan steps --dwell {longer:.2g})"
+
+
 def _message(
     calibration: Calibration,
     peak_to_valley: float,
-    residual: float,
+    residuals: tuple[float, float],
     budget: float,
     binding: SpeedLimit,
 ) -> str:
+    residual, hidden = residuals
     verdict = "within" if 2 * residual <= budget else "beyond"
     factor = binding.speed_factor
-    if factor == 0:
+    if factor == 0 and binding.name == DYNAMICS:
+        better = _better_calibration(calibration, residuals, budget)
+        advice = f"{better}: no speed of this path is within the limit of dynamics"
+    elif factor == 0:
         advice = f"no speed of this path is within the limit of {binding.name}"
     elif factor >= FASTEST:
         advice = f"it may be run {FASTEST:g} times as fast, further was not tried"
     elif factor >= 1:
         advice = f"it may be run up to {plain(factor)} times as fast; then {binding.name} binds"
     elif binding.name == DYNAMICS:
-        advice = (
-            "calibrate better (longer plateaus and more steps, omsm plan steps), or run it at "
-            f"{plain(factor)} times this speed"
-        )
+        better = _better_calibration(calibration, residuals, budget)
+        advice = f"{better}, or run it at {plain(factor)} times this speed"
     else:
         advice = f"run it at {plain(factor)} times this speed or slower: {binding.name} binds"
     return (
         f"dynamic error {quantity(peak_to_valley, 'm')} peak to valley; corrected within "
-        f"{quantity(2 * residual, 'm')} (k = 2, largest on the path), {verdict} the budget "
+        f"{quantity(2 * residual, 'm')} (k = 2, largest on the path"
+        f"{_what_could_hide(calibration, hidden)}), {verdict} the budget "
         f"of {quantity(budget, 'm')}; {advice} (trusted up to "
         f"{quantity(calibration.valid_up_to, 'Hz')})"
     )

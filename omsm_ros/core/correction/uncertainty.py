@@ -110,18 +110,21 @@ def contributions(
     static_gain: float,
     distance: FloatArray,
     dynamics: FloatArray,
+    hidden: FloatArray,
     z_rate: FloatArray,
     abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
     """Variances of the heights [m²] by their source, each (n,) or the same for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
-    dynamics: variance of H(z) from the covariance [m²], (n,);  z_rate: of H(z) [m/s], (n,)
+    dynamics, hidden: variance of H(z) [m²] from the noise of the step test, and from what the
+        test could not show, (n,);  z_rate: of H(z) [m/s], (n,)
     abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
     return {
         "dynamics": dynamics,
+        "could_hide": hidden,
         "lateral_lag": (sources.lateral_lag * z_rate) ** 2,
         "static_gain": (scale * distance) ** 2,
         "probe_noise": (sources.probe_noise / static_gain) ** 2,
@@ -145,6 +148,15 @@ def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> Sur
     slope_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
     variance = points.uncertainty**2 + lateral**2 * (slope_x**2 + slope_y**2)
     return replace(points, uncertainty=np.sqrt(variance))
+
+
+def uncertain_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
+    """The calibration with the covariance from noise alone, and with that of what could hide."""
+    hidden = calibration.hidden_covariance
+    return (
+        replace(calibration, covariance=calibration.covariance - hidden),
+        replace(calibration, covariance=hidden),
+    )
 
 
 def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[DigitalFilter]:

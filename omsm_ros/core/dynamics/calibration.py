@@ -20,6 +20,8 @@ from omsm_ros.quantities import FREQUENCY, GAIN, SAMPLE_PERIOD
 
 SCHEMA = "omsm-calibration/1"
 REJECTED = "rejected"
+# A difference of two covariances this little indefinite, of correlations, is rounding.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,6 +83,18 @@ class Calibration:
         ):
             return self.covariance
         return np.asarray(stated, np.float64).reshape(self.covariance.shape)
+
+    @property
+    def hidden_covariance(self) -> FloatArray:
+        """Covariance (p, p) of what the step test could not show, beyond its noise.
+
+        Zero where the certificate does not tell the two apart.
+        """
+        hidden = self.covariance - self.noise_covariance
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        scale = np.where(deviation > 0, deviation, 1.0)
+        least = float(np.min(np.linalg.eigvalsh(hidden / np.outer(scale, scale))))
+        return hidden if least > -_ROUNDING else np.zeros_like(hidden)
 
     @property
     def low_frequency_delay_noise(self) -> float:

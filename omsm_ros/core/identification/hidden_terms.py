@@ -12,7 +12,7 @@ a variance of the whole numerator; only slower than ``valid_from`` is the gain o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,7 +152,13 @@ def hidden_covariance(
     finding = gain_above_rest(open_gain, slow, survey.plateau, limits.gain)
     finding = replace(
         finding,
-        entries={**finding.entries, "could_hide": entries, "assumed": _assumptions(survey)},
+        entries={
+            **finding.entries,
+            "could_hide": entries,
+            "hidden_mostly": _mostly(terms, priors),
+            "plateau_s": survey.plateau,
+            "assumed": _assumptions(survey),
+        },
     )
     return [CovarianceTerm(c) for c in covariance] + [
         CovarianceTerm(np.zeros((_size(survey.fitted),) * 2), finding)
@@ -226,6 +232,17 @@ def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
         "effect_on_scan_m": term.effect * carried,
         "missed_effect_on_scan_m": term.effect * term.missed,
     }
+
+
+def _mostly(terms: Sequence[HiddenTerm], priors: Mapping[str, float]) -> str:
+    """Words for what costs most of what could hide; empty where nothing could."""
+    if not terms:
+        return ""
+    worst = max(terms, key=lambda term: term.effect * _carried(term, priors))
+    return {
+        CREEP: f"a slow relaxation (creep) of {worst.parameter:.3g} s",
+        MODE: f"a light mode at {worst.parameter:.3g} Hz",
+    }.get(worst.family, "a stiffness that grows with the deflection")
 
 
 def _assumptions(survey: Survey) -> list[str]:

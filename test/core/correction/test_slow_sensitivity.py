@@ -1,13 +1,16 @@
 """A gain that is open above a hundredth of a hertz costs its share of the travel, not more."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.predict import residual_over_time
+from omsm_ros.core.correction.predict import predict_error, residual_over_time
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.machine.limits import MachineLimits, ScanPath
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 
 PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015
@@ -15,6 +18,74 @@ AMPLITUDE = 0.5e-3
 TIME = np.arange(120_000) * PERIOD
 # The lag is mechanical: no term of its own here.
 OPTIONS = CorrectionOptions(lateral_lag=0.0, sources=ErrorSources())
+
+
+LAG_NOISE = 1e-6
+
+
+def with_noise(scale: float = 1.0) -> Calibration:
+    """The gain could hide, and the lag is known to a microsecond of noise."""
+    noise = np.diag([0.0, 0.0, LAG_NOISE**2])
+    known = calibration()
+    certificate = {
+        "noise_covariance": (scale * noise).ravel().tolist(),
+        "hidden_mostly": "creep of 10.5 s",
+        "plateau_s": 0.5,
+    }
+    return replace(
+        known,
+        covariance=known.covariance + noise,
+        certificate={**known.certificate, **certificate},
+    )
+
+
+def corrected(known: Calibration, z: np.ndarray) -> Corrector:
+    """In blocks, for a queue of minutes is not kept."""
+    corrector = Corrector(known, OPTIONS)
+    for first in range(0, len(z), 5000):
+        part = z[first : first + 5000]
+        zero = np.zeros(len(part))
+        place = {"stamp_ns": first * 10**6, "first_sample": first, "sample_period": PERIOD}
+        corrector.push_axes(AxisBlock(**place, x=zero, y=zero, z=part, b=zero, c=zero))
+        corrector.push_distance(DistanceBlock(**place, distance=-part))
+        corrector.take()
+    corrector.finish()
+    return corrector
+
+
+def test_noise_and_what_could_hide_are_two_terms_of_the_budget():
+    z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
+    budget = corrected(with_noise(), z).budget
+    assert budget["dynamics"] == pytest.approx(
+        LAG_NOISE * 2 * np.pi * AMPLITUDE / np.sqrt(2), rel=0.02
+    )
+    assert budget["could_hide"] == pytest.approx(OPEN * AMPLITUDE / np.sqrt(2), rel=0.03)
+    total = corrected(replace(with_noise(), certificate={"valid_from": VALID_FROM}), z).budget
+    assert total["could_hide"] == 0.0
+    assert total["dynamics"] == pytest.approx(
+        np.hypot(budget["dynamics"], budget["could_hide"]), rel=0.02
+    )
+
+
+def test_noise_that_exceeds_the_covariance_divides_nothing():
+    """A certificate whose parts contradict the whole is not believed."""
+    known = with_noise(scale=4.0)
+    assert not np.any(known.hidden_covariance)
+    assert np.any(with_noise().hidden_covariance)
+
+
+def test_the_prediction_names_what_could_hide_and_the_rest_that_would_tell_it():
+    z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
+    unlimited = MachineLimits(
+        servo_frequency=None, probe_range=None, spindle_speed_rpm=None, motion_frequency=None
+    )
+    path = ScanPath(z=z, sample_period=PERIOD)
+    found = predict_error(with_noise(), path, 50e-9, unlimited)
+    assert found.residual_hidden == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
+    assert found.residual == pytest.approx(found.residual_hidden, rel=0.01)
+    assert "could not have shown, mostly creep of 10.5 s" in found.message
+    # 100 nm against 50 nm: four times as long.
+    assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
 
 
 def calibration() -> Calibration:

@@ -221,6 +221,7 @@ def test_contributions_by_hand() -> None:
         0.5,
         np.array([0.0, 4.0]),
         np.array([7.0, 8.0]),
+        np.array([5.0, 6.0]),
         np.array([9.0, 10.0]),
         abbe_arm=0.1,
     )
@@ -233,6 +234,7 @@ def test_contributions_by_hand() -> None:
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
     assert found["pitch"] == pytest.approx((200e-9) ** 2)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
+    assert found["could_hide"] == pytest.approx([5.0, 6.0])
     assert found["lateral_lag"] == pytest.approx([81e-6, 100e-6])
 
 
