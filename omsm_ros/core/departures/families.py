@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy import fft, signal
 
+from omsm_ros.core.departures.hysteresis import dahl, lost_in_gap, without_noise
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps, backlash_columns
@@ -30,9 +32,11 @@ _CREEPS_A_DECADE = 5
 _DAMPINGS = (0.03, 0.15)
 _FASTEST_MODE_HZ = 100.0
 # Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
-_SLIDING_TRAVELS_M = (0.05e-6, 0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
-# What gives way over less is a gap, not a drag.
-_BACKLASH_TRAVEL_M = 0.3e-6
+_SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
+# Values a sample at which a reversal is looked for: at 0.2 m/s² half a nanometre is missed.
+_FINER = 8
+# A motion crosses any of them in about a sample, so few do.
+_GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
 _MOST_CYCLES = 100
 _DRIFT_DEGREES = (2, 3, 4, 6, 8)
 _LINES_TRIED = 3
@@ -73,12 +77,9 @@ class Family:
     def term(self, index: int) -> Term:
         """The term at ``index``."""
         part = slice(index * self.width, (index + 1) * self.width)
-        name = self.name
-        if name == FRICTION and self.parameters[index] <= _BACKLASH_TRAVEL_M:
-            name = BACKLASH
         damping = 0.0 if self.dampings is None else float(self.dampings[index])
         parameter = float(self.parameters[index])
-        return Term(name, parameter, self.trials, self.columns[:, part], damping)
+        return Term(self.name, parameter, self.trials, self.columns[:, part], damping)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +106,13 @@ class Departures:
         for name, make in makers.items():
             if not only or name in only:
                 yield from make()
+
+    def again(self, term: Term) -> Term:
+        """The ``term`` of another fit as this one has it."""
+        for family in self.families((term.family,)):
+            for index in np.flatnonzero(family.parameters == term.parameter):
+                return family.term(int(index))
+        return term
 
     @property
     def duration(self) -> float:
@@ -216,15 +224,31 @@ class Departures:
         """Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
         if not self.steps.edges:
             return
-        moved = _without_noise(self.problem.input, self.steps)
-        columns = [c for travel in _SLIDING_TRAVELS_M for c in dahl(moved, travel)]
+        columns = [
+            c for travel in _SLIDING_TRAVELS_M for c in dahl(self._turning[::_FINER], travel)
+        ]
         gain = self.fitted.gain
         yield Family(
             FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, -gain * np.column_stack(columns)
         )
 
+    @cached_property
+    def _turning(self) -> FloatArray:
+        """Where the structure stands that drags or has a gap, with its true reversals.
+
+        A motion turns between samples, and what a gap remembers is how far it came:
+        ``_FINER`` values a sample.
+        """
+        length = _FINER * self.problem.closed_length
+        answer = _FINER * fft.irfft(self._answer / self.fitted.gain, length)
+        return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
+
     def backlash(self) -> Iterator[Family]:
-        """Half of the backlash, against the direction of the last move."""
+        """Half of the backlash: against the last reversal, and against the last step."""
+        if self.steps.edges:
+            lost = [c[::_FINER] for gap in _GAPS_M for c in lost_in_gap(self._turning, gap)]
+            gain = self.fitted.gain
+            yield Family(BACKLASH, np.asarray(_GAPS_M), 2.0, -gain * np.column_stack(lost))
         columns = backlash_columns(self.steps, len(self.problem.input))
         if columns.shape[1]:
             yield Family(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
@@ -232,12 +256,6 @@ class Departures:
 
 def _geometric(low: float, high: float, step: float) -> FloatArray:
     return np.geomspace(low, high, int(np.log(high / low) / step) + 1)
-
-
-def _without_noise(motion: FloatArray, steps: Steps) -> FloatArray:
-    """``motion`` (n,) that stays where the axis rests, so that noise is no path."""
-    change = np.where(steps.moving[1:] & steps.moving[:-1], np.diff(motion), 0.0)
-    return np.concatenate([[0.0], np.cumsum(change)])
 
 
 def relaxed(values: FloatArray, step: float) -> FloatArray:
@@ -250,19 +268,3 @@ def relaxed(values: FloatArray, step: float) -> FloatArray:
     rest = values - values[0]
     filtered = signal.lfilter([1 - mean, mean - kept], [1.0, -kept], rest)
     return np.asarray(filtered + values[0])
-
-
-def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
-    """Friction force between -1 and 1 along ``motion`` (n,), and what is left of its start.
-
-    dF/dx = (1 - F sgn v) / travel.
-    """
-    change = np.diff(motion, prepend=motion[0])
-    kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
-    force, value = np.zeros(len(motion)), 0.0
-    for index in np.flatnonzero(change):
-        value = direction[index] + (value - direction[index]) * kept[index]
-        force[index] = value
-    moved = change != 0
-    last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
-    return force[last], np.cumprod(kept)

@@ -117,9 +117,11 @@ def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[t
             coefficients, spread = coefficients[:1], spread[:1, :1]
         if modelled.term.family == DRIFT:
             added = problem.background[:, modelled.columns] @ coefficients
-            found.append((float(np.std(added)), float(np.sqrt(np.trace(spread) / 2))))
+            found.append((float(np.std(added)), float(np.sqrt(max(np.trace(spread), 0.0) / 2))))
             continue
-        found.append((float(np.linalg.norm(coefficients)), float(np.sqrt(np.trace(spread)))))
+        found.append(
+            (float(np.linalg.norm(coefficients)), float(np.sqrt(max(np.trace(spread), 0.0))))
+        )
     return found
 
 

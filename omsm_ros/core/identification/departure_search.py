@@ -33,11 +33,15 @@ from omsm_ros.core.identification.model_choice import Model
 
 _MOST_ROUNDS = 6
 _BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
+# Their columns follow the fitted response, which they improve.
+_TURNING = {BACKLASH, FRICTION}
 _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
 # Odds below which the data do not choose, as a logarithm (Kass and Raftery 1995: very strong).
 _UNDECIDED = 5.0
 # A decay slower than the record is a drift.
 _LEAST_DECAYS = 1.0
+# A structure and its roll-off; what is not linear looks like many more.
+_PLAIN_POLES = 2
 # Two time constants a decade apart look much the same: the fit starts at several.
 _FASTER = (1.0, 2.0, 5.0)
 
@@ -76,15 +80,26 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
     """
     prepared, beside = _with_columns(prepared, _drift(prepared))
     prepared, model = choose(prepared)
+    columns = _imitated(prepared, model)
+    if columns:
+        prepared, added = _with_columns(prepared, columns, beside)
+        beside += added
+        prepared, model = choose(prepared)
     grown: list[Term] = []
+    settled: set[str] = set()
     refused: set[str] = set() if may_grow else {CREEP, MODE}
     survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
-        shown = survey.significant(refused)
+        shown = survey.significant(refused | settled)
         if not shown:
             break
         columns = _beside(survey, shown)
-        if columns:
+        again = {c.term.family for c in columns} & _TURNING & {b.term.family for b in beside}
+        if again:
+            prepared, beside = _renewed(prepared, survey, beside, again)
+            settled |= again
+            prepared, model = choose(prepared)
+        elif columns:
             prepared, added = _with_columns(prepared, columns, beside)
             beside += added
             prepared, model = choose(prepared)
@@ -97,7 +112,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
             prepared, model = larger
             grown.append(shown[0].term)
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
-    return Searched(prepared, model, survey, beside, grown, survey.significant())
+    return Searched(prepared, model, survey, beside, grown, survey.significant(settled))
 
 
 def _drift(prepared: Prepared) -> list[Judged]:
@@ -108,6 +123,28 @@ def _drift(prepared: Prepared) -> list[Judged]:
     return [
         judged for judged in _beside(survey, survey.significant()) if judged.term.family == DRIFT
     ]
+
+
+def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
+    """Departures that the poles of ``model`` imitate: a plain one beside them describes more.
+
+    What is not linear is not bent into poles where fewer of them and its own columns do better.
+    """
+    chosen = model.chosen
+    plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
+    if chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
+        return []
+    best = min(plain, key=lambda candidate: candidate.bic).fit
+    survey = Survey(prepared.problem, best, prepared.steps, _BESIDE)
+    columns = _beside(survey, survey.significant())
+    if not columns:
+        return []
+    problem = _with_columns(prepared, columns)[0].problem
+    beside = fit(problem, best.structure, [best.nonlinear])
+    price = (problem.background.shape[1] - prepared.problem.background.shape[1]) * np.log(
+        beside.samples
+    )
+    return columns if information(beside) + price < information(chosen.fit) else []
 
 
 def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
@@ -138,6 +175,20 @@ def _with_columns(
         added.append(ModelledTerm(judged.term, slice(start, background.shape[1])))
     problem = replace(prepared.problem, background=background)
     return replace(prepared, problem=problem), added
+
+
+def _renewed(
+    prepared: Prepared, survey: Survey, beside: Sequence[ModelledTerm], families: set[str]
+) -> tuple[Prepared, list[ModelledTerm]]:
+    """The problem with the columns of ``families`` as the fit of ``survey`` has them."""
+    background, renewed = prepared.problem.background.copy(), []
+    for modelled in beside:
+        term = modelled.term
+        if term.family in families:
+            term = survey.departures.again(term)
+            background[:, modelled.columns] = term.columns
+        renewed.append(ModelledTerm(term, modelled.columns))
+    return replace(prepared, problem=replace(prepared.problem, background=background)), renewed
 
 
 def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Model] | None:

@@ -1,0 +1,61 @@
+"""What depends on where a motion turned last: backlash (a gap), and friction before it slides.
+
+Both know reversals only, not time. A reversal is told from noise by a gap of a few times the
+noise, which the motion has to cross; so they hold still where the axis rests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+
+# What noise does beyond is far less than any gap looked for; a wider one would lose reversals.
+_NOISE_HALF_GAP = 2.0
+
+
+def without_noise(motion: FloatArray, noise: float) -> FloatArray:
+    """``motion`` (n,) [m] with those reversals only that ``noise`` [m], its deviation, is not."""
+    return through_gap(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
+
+
+def through_gap(motion: FloatArray, half: float) -> FloatArray:
+    """What ``motion`` (n,) drives through a gap of ±``half`` [m], in its middle at first."""
+    change = np.diff(motion, prepend=motion[0])
+    moved = np.flatnonzero(change)
+    if len(moved) == 0:
+        return motion.copy()
+    # Along a run of one direction only its end counts.
+    turns = moved[np.flatnonzero(np.diff(np.sign(change[moved])))]
+    ends = np.append(turns, len(motion) - 1)
+    held, state, first = np.empty_like(motion), motion[0], 0
+    for end in ends:
+        held[first : end + 1] = state
+        state, first = min(max(state, motion[end] - half), motion[end] + half), end + 1
+    return np.asarray(np.clip(held, motion - half, motion + half))
+
+
+def lost_in_gap(motion: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Share -1 to 1 of half the ``gap`` [m] that ``motion`` (n,) is ahead, and its unknown start.
+
+    Until the whole gap is crossed, what is ahead depends on where in it the motion began.
+    """
+    ahead = (motion - through_gap(motion, 0.5 * gap)) / (0.5 * gap)
+    crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
+    return np.asarray(ahead), np.asarray(np.clip(1.0 - crossed / gap, 0.0, 1.0))
+
+
+def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
+    """Friction force between -1 and 1 along ``motion`` (n,), and what is left of its start.
+
+    dF/dx = (1 - F sgn v) / travel (Dahl 1968).
+    """
+    change = np.diff(motion, prepend=motion[0])
+    kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
+    force, value = np.zeros(len(motion)), 0.0
+    for index in np.flatnonzero(change):
+        value = direction[index] + (value - direction[index]) * kept[index]
+        force[index] = value
+    moved = change != 0
+    last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
+    return force[last], np.cumprod(kept)
