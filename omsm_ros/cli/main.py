@@ -35,6 +35,7 @@ WORDS = {
     "omsm_ros.cli.campaigning": ("batch",),
     "omsm_ros.cli.remembering": ("history",),
     "omsm_ros.cli.exporting": ("export",),
+    "omsm_ros.cli.comparing": ("difference",),
 }
 
 # What stands after "--" is for the command that these run in turn.

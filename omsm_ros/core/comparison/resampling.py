@@ -10,33 +10,35 @@ not surround the place.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from omsm_ros.core.comparison.cells import Trend, averaged, cell_side, portions
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 
+Rows = Callable[[int, int], FloatArray]
+
 RADIUS_CELLS = 2.4
 """Radius of a local fit in sides of a cell: some eighteen cells for six coefficients."""
 
-_TREND_DEGREE = 6
-_TREND_POINTS = 20_000
-# Twice as large cells are a quarter as many where the points fill the surface.
-_FILLED = 3.5
-_FEWEST_CELLS_ACROSS = 8
 _LEAST_NEIGHBOURS = 9
 # A place at the straight edge of evenly spread cells has its tricube-weighted centre 0.30 radii
 # inside; farther out than that a fit extrapolates.
 _LARGEST_OFFSET = 0.36
+# Variance of a value over that of the mean of one cell: a third amid the points; more where the
+# points stand on one side and the quadratic extrapolates.
+_LARGEST_GAIN = 1.0
 # The value of a quadratic whose columns are nearly dependent is a guess.
 _WORST_CONDITION = 1e-6
-_PORTION = 20_000
 _WIDER, _PROBED = 1.5, 3_000
+# Standard deviation of a normal distribution over the median of its magnitudes.
+_SIGMA_OF_MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,33 +46,19 @@ class LocalHeights:
     """Heights at places (m,); NaN where the points do not surround a place.
 
     value: [m];  slope_x, slope_y: [1]
-    independent: standard uncertainty [m] of the value if the points' errors are independent
-    stated: the points' own standard uncertainty there [m]; both NaN where none is stated
+    density: points in a cell there, harmonic mean
+    gain: variance of the value over that of one point, if the points' errors are independent
+    stated: the points' own standard uncertainty there [m]; NaN where none is stated
+    order: mean place of the points in the order of the scan, 0 to 1; NaN where none is known
     """
 
     value: FloatArray
     slope_x: FloatArray
     slope_y: FloatArray
-    independent: FloatArray
+    density: FloatArray
+    gain: FloatArray
     stated: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cells:
-    """Means of the points in square cells, each (k,).
-
-    xx, xy, yy: mean products of the points' distances from the middle of their cell [m²]
-    variance: mean square of their uncertainty [m²]
-    """
-
-    x: FloatArray
-    y: FloatArray
-    height: FloatArray
-    xx: FloatArray
-    xy: FloatArray
-    yy: FloatArray
-    variance: FloatArray
-    points: FloatArray
+    order: FloatArray
 
 
 class LocalQuadratic:
@@ -81,14 +69,20 @@ class LocalQuadratic:
 
     def __init__(self, points: MeasuredPoints, cell: float) -> None:
         self.cell = cell
-        self._trend = _Trend(points)
-        self._cells = _averaged(points, points.height - self._trend.at(points.x, points.y), cell)
+        self._trend = Trend(points)
+        self._cells, self._cell = averaged(
+            points, points.height - self._trend.at(points.x, points.y), cell
+        )
         if len(self._cells.x) < _LEAST_NEIGHBOURS:
             raise DataError(
                 f"the points fill {len(self._cells.x)} cells of {cell:.3g} m, too few for a "
                 "surface between them; measure an area, or choose smaller cells"
             )
         self._tree = cKDTree(np.column_stack([self._cells.x, self._cells.y]))
+        some = slice(None, None, max(len(points) // _PROBED, 1))
+        near = self.at(points.x[some], points.y[some])
+        residual = (points.height[some] - near.value)[np.isfinite(near.value)]
+        self._scatter = _SIGMA_OF_MAD * float(np.median(np.abs(residual))) if len(residual) else 0.0
 
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
         """Heights, slopes and their uncertainties at x, y [m], each (m,)."""
@@ -98,9 +92,46 @@ class LocalQuadratic:
             value=found[0] + self._trend.at(x, y),
             slope_x=found[1] + tx,
             slope_y=found[2] + ty,
-            independent=found[3],
-            stated=found[4],
+            density=found[3],
+            gain=found[4],
+            stated=found[5],
+            order=found[6],
         )
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of a single point about the surface between its neighbours [m].
+
+        By the median of the points' distances, so that dust does not count; it holds what is
+        shorter than a local fit averages over.
+        """
+        return self._scatter
+
+    def carried(self, rows: Rows, x: FloatArray, y: FloatArray) -> FloatArray:
+        """What is so much at the points is so much at x, y (m,): rows of errors, (s, m) [m].
+
+        rows: errors (s, c) [m] of ``c`` points from a first one on
+        """
+        means = self._means(rows)
+        parts = []
+        for p in portions(len(x)):
+            good, share, chosen = self._shares(x[p], y[p], RADIUS_CELLS * self.cell)
+            part = np.full((len(means), len(good)), np.nan)
+            part[:, good] = np.einsum("mk,smk->sm", share[:, 0], means[:, chosen])
+            parts.append(part)
+        return np.concatenate([np.empty((len(means), 0)), *parts], axis=1)
+
+    def _means(self, rows: Rows) -> FloatArray:
+        """Mean of each row over the points of each cell, (s, k)."""
+        sums: FloatArray | None = None
+        for p in portions(len(self._cell)):
+            cell = self._cell[p]
+            part = rows(p.start, len(cell))
+            if sums is None:
+                sums = np.zeros((len(part), len(self._cells.x)))
+            for total, values in zip(sums, part, strict=True):
+                total += np.bincount(cell, values, len(total))
+        return np.empty((0, 0)) if sums is None else sums / self._cells.points
 
     def method_error(self, x: FloatArray, y: FloatArray) -> float:
         """Rms error of the interpolation at places like x, y (m,) [m], from above.
@@ -118,11 +149,32 @@ class LocalQuadratic:
         return float(np.sqrt(np.mean(change**2))) / (_WIDER**3 - 1)
 
     def _fitted(self, x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
-        """Value, slopes, independent and stated uncertainty less the trend, (5, m)."""
-        parts = [self._portion(x[p], y[p], radius) for p in _portions(len(x))]
-        return np.concatenate([np.empty((5, 0)), *parts], axis=1)
+        """Return what :class:`LocalHeights` holds, less the trend, (7, m)."""
+        parts = [self._portion(x[p], y[p], radius) for p in portions(len(x))]
+        return np.concatenate([np.empty((7, 0)), *parts], axis=1)
 
     def _portion(self, x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
+        cells = self._cells
+        good, share, chosen = self._shares(x, y, radius)
+        found = np.full((7, len(x)), np.nan)
+        for place, scale in enumerate((1.0, 1 / radius, 1 / radius)):
+            found[place, good] = scale * np.sum(share[:, place] * cells.height[chosen], axis=1)
+        # Around a place the cells' own values, by the distance alone.
+        near = np.abs(share[:, 0]) / np.sum(np.abs(share[:, 0]), axis=1, keepdims=True)
+        found[3, good] = 1 / np.sum(near / cells.points[chosen], axis=1)
+        found[4, good] = np.sum(share[:, 0] ** 2 / cells.points[chosen], axis=1)
+        found[5, good] = np.sqrt(np.sum(near * cells.variance[chosen], axis=1))
+        found[6, good] = np.sum(near * cells.order[chosen], axis=1)
+        found[:, ~(found[3] * found[4] < _LARGEST_GAIN)] = np.nan
+        return found
+
+    def _shares(
+        self, x: FloatArray, y: FloatArray, radius: float
+    ) -> tuple[BoolArray, FloatArray, IntArray]:
+        """Which places (m,) cells surround; of those, the shares (g, 3, k) of cells (g, k).
+
+        Shares in the value and in both slopes times the radius.
+        """
         cells = self._cells
         most = min(int(4.5 * (radius / self.cell) ** 2) + 8, len(cells.x))
         distance, index = self._tree.query(
@@ -136,18 +188,9 @@ class LocalQuadratic:
         u = np.where(inside, (cells.x[index] - x[:, None]) / radius, 0.0)
         v = np.where(inside, (cells.y[index] - y[:, None]) / radius, 0.0)
         good = self._surrounded(u, v, weight, inside)
-        moments = [m[index[good]] / radius**2 for m in (cells.xx, cells.xy, cells.yy)]
-        rows = _first_rows(u[good], v[good], moments, weight[good])
-        found = np.full((5, len(x)), np.nan)
         chosen = index[good]
-        for place, scale in enumerate((1.0, 1 / radius, 1 / radius)):
-            found[place, good] = scale * np.sum(rows[:, place] * cells.height[chosen], axis=1)
-        variance = cells.variance[chosen]
-        share = rows[:, 0]
-        found[3, good] = np.sqrt(np.sum(share**2 * variance / cells.points[chosen], axis=1))
-        near = weight[good] / np.sum(weight[good], axis=1, keepdims=True)
-        found[4, good] = np.sqrt(np.sum(near * variance, axis=1))
-        return found
+        moments = [m[chosen] / radius**2 for m in (cells.xx, cells.xy, cells.yy)]
+        return good, _first_rows(u[good], v[good], moments, weight[good]), chosen
 
     @staticmethod
     def _surrounded(
@@ -182,107 +225,6 @@ def _first_rows(
     first = np.eye(6)[:, :3] / scale[:, :, None]
     solved = np.linalg.solve(normal, first) / scale[:, :, None]
     return np.asarray(np.einsum("mki,mij->mjk", weighted, solved), np.float64)
-
-
-# -------------------------------------------------------------------------------- trend
-
-
-class _Trend:
-    """A polynomial of the whole surface, by least squares."""
-
-    def __init__(self, points: MeasuredPoints) -> None:
-        some = slice(None, None, max(len(points) // _TREND_POINTS, 1))
-        x, y = points.x[some], points.y[some]
-        self._middle = (float(np.mean(x)), float(np.mean(y)))
-        self._scale = float(max(np.ptp(points.x), np.ptp(points.y))) / 2 or 1.0
-        degree = _TREND_DEGREE if len(x) > 10 * len(_powers(_TREND_DEGREE)) else 1
-        self._powers = _powers(degree)
-        self._coefficients = np.linalg.lstsq(self._columns(x, y), points.height[some], rcond=1e-10)[
-            0
-        ]
-
-    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Its height [m], (n,)."""
-        parts = [self._columns(x[p], y[p]) @ self._coefficients for p in _portions(len(x))]
-        return np.concatenate([np.empty(0), *parts])
-
-    def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Its slopes [1], each (n,)."""
-        step = 1e-5 * self._scale
-        return (
-            (self.at(x + step, y) - self.at(x - step, y)) / (2 * step),
-            (self.at(x, y + step) - self.at(x, y - step)) / (2 * step),
-        )
-
-    def _columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        u, v = (x - self._middle[0]) / self._scale, (y - self._middle[1]) / self._scale
-        powers_u, powers_v = ([np.ones_like(x)], [np.ones_like(x)])
-        for _ in range(max(i + j for i, j in self._powers)):
-            powers_u.append(powers_u[-1] * u)
-            powers_v.append(powers_v[-1] * v)
-        return np.stack([powers_u[i] * powers_v[j] for i, j in self._powers], axis=1)
-
-
-def _powers(degree: int) -> list[tuple[int, int]]:
-    return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
-
-
-# -------------------------------------------------------------------------------- cells
-
-
-def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
-    """Return the least side [m] of cells that points (n,) fill, no more than ``most`` across."""
-    wide, high = float(np.ptp(x)), float(np.ptp(y))
-    extent = max(wide, high)
-    if min(wide, high) <= 0:
-        raise DataError(
-            f"the points cover {wide:.3g} × {high:.3g} m, which is no area; a profile cannot be "
-            "made into a map"
-        )
-    side = max(float(np.sqrt(wide * high / len(x))), extent / most)
-    while extent / side > _FEWEST_CELLS_ACROSS:
-        if _occupied(x, y, side) >= _FILLED * _occupied(x, y, 2 * side):
-            break
-        side *= 2 ** (1 / 2)
-    return side
-
-
-def _occupied(x: FloatArray, y: FloatArray, side: float) -> int:
-    column, row = _place(x, side), _place(y, side)
-    return int(np.count_nonzero(np.bincount(column * (int(row.max()) + 1) + row)))
-
-
-def _place(values: FloatArray, side: float) -> IntArray:
-    return np.asarray(np.floor((values - values.min()) / side), np.int64)
-
-
-def _averaged(points: MeasuredPoints, height: FloatArray, side: float) -> _Cells:
-    column, row = _place(points.x, side), _place(points.y, side)
-    _, cell, count = np.unique(
-        column * (int(row.max()) + 1) + row, return_inverse=True, return_counts=True
-    )
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(cell, values, len(count)) / count, np.float64)
-
-    x, y = mean(points.x), mean(points.y)
-    dx, dy = points.x - x[cell], points.y - y[cell]
-    spread = np.full(len(points), np.nan) if points.uncertainty is None else points.uncertainty
-    return _Cells(
-        x=x,
-        y=y,
-        height=mean(height),
-        xx=mean(dx * dx),
-        xy=mean(dx * dy),
-        yy=mean(dy * dy),
-        variance=mean(spread**2),
-        points=count.astype(np.float64),
-    )
-
-
-def _portions(count: int) -> Iterator[slice]:
-    for start in range(0, count, _PORTION):
-        yield slice(start, start + _PORTION)
 
 
 # --------------------------------------------------------------------------------- grid

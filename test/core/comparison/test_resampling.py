@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side, on_grid
+from omsm_ros.core.comparison.cells import cell_side
+from omsm_ros.core.comparison.resampling import LocalQuadratic, on_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 
@@ -77,9 +78,9 @@ def test_independent_errors_scatter_as_stated():
         for seed in range(30)
     ]
     scatter = np.std([run.value for run in runs], axis=0)
-    assert np.median(scatter / runs[0].independent) == pytest.approx(1, abs=0.08)
+    assert np.median(scatter / (10e-9 * np.sqrt(runs[0].gain))) == pytest.approx(1, abs=0.08)
     assert runs[0].stated == pytest.approx(10e-9)
-    assert np.all(runs[0].independent < 8e-9)
+    assert np.all(runs[0].gain < 0.6)
 
 
 def test_no_height_is_made_up_outside_or_in_a_hole():

@@ -1,0 +1,124 @@
+"""The command that compares two measurements of one part: difference."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
+from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.cli.exporting import UNIT
+from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.jobs.compare_measurements import (
+    DIFFERENCE,
+    MAP,
+    Ways,
+    compare_measurements,
+    write_difference,
+)
+from omsm_ros.storage.machine_files import load_surface
+from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.units import NANOMETRE_M
+
+# ---------------------------------------------------------------------------- difference
+
+
+def _freedoms(text: str) -> tuple[str, ...]:
+    """Argument type: freedoms of the second measurement against the first."""
+    if text == "auto":
+        return tuple(name for name in FREEDOMS if name != "power")
+    try:
+        return freedoms_named(tuple(filter(None, text.split(","))))
+    except ConfigurationError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def _declare_difference(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("a", type=Path, help="a result folder, a cloud or a map of any format")
+    sub.add_argument("b", type=Path, help="another of the same part, moved onto the first")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument(
+        "--fit",
+        type=_freedoms,
+        default=SEATED,
+        metavar="FREEDOMS",
+        help=f"of {','.join(FREEDOMS)}; 'auto': all but power that the surface determines; "
+        f"default {','.join(SEATED)}",
+    )
+    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="taken off both first")
+    sub.add_argument(
+        "--uncertainty",
+        type=number(quantities.UNCERTAINTY),
+        help="standard uncertainty of the heights of a file that carries none [m]",
+    )
+    sub.add_argument(
+        "--drift",
+        type=number(quantities.UNCERTAINTY),
+        help="standard deviation of the drift at the end of a scan [m]; default: as its sources "
+        "say, or estimated from the difference",
+    )
+    sub.add_argument("--unit", **UNIT)
+    sub.add_argument(
+        "--spacing", type=number(quantities.SPACING), help="of the places compared [m]"
+    )
+    sub.add_argument(
+        "--correlation-length",
+        type=number(quantities.SPACING),
+        help="of errors of unknown form [m]; default: half the radius",
+    )
+
+
+def _difference(args: argparse.Namespace) -> Facts:
+    ways = Ways(
+        freedoms=args.fit,
+        uncertainty=args.uncertainty,
+        drift=args.drift,
+        units=args.unit,
+        spacing=args.spacing,
+        length=args.correlation_length,
+    )
+    nominal = load_surface(args.nominal) if args.nominal else None
+    found, facts = compare_measurements(args.a, args.b, ways, nominal)
+    with result_folder(args.out, (MAP, DIFFERENCE)) as out:
+        write_difference(out, found, facts)
+    return {**facts, "files": {"difference": DIFFERENCE, "map": MAP}}
+
+
+def _show_difference(facts: Facts) -> None:
+    found = facts["difference"]
+    rows = [("verdict", facts["verdict"])]
+    rows += [("because", text) for text in facts["reasons"]]
+    rows += [("but", text) for text in facts["reservations"]]
+    rows += [
+        ("difference", f"{_nm(found['peak_to_valley'])} PV, "
+                       f"{_nm(found['robust_peak_to_valley'])} PV of 99.5 %, "
+                       f"{_nm(found['rms'])} rms"),
+        ("uncertainty", "not evaluated" if found["uncertainty"] is None else
+                        f"{_nm(found['uncertainty'])} rms (k = 1)"),
+        ("places", f"{found['places']} of {facts['resampling']['spacing'] * 1e3:.3g} mm, "
+                   f"{100 * found['shared_area']:.0f} % of the smaller area"),
+    ]  # fmt: skip
+    for name, n in facts["e_n"].items():
+        told = "not evaluated" if n["e_n"] is None else f"{n['e_n']:.2f} (U {_nm(n['expanded'])})"
+        label = f"E_n of {name.replace('_', ' ')}"
+        rows.append((label, f"{told}: {_nm(n['a'])} and {_nm(n['b'])}"))
+    if facts["within"] is not None:
+        rows.append(("points", f"|E_n| < 1 on {100 * facts['within']:.1f} % of the area"))
+    table([*rows, ("written", ", ".join(facts["files"].values()))])
+
+
+def _nm(value: float) -> str:
+    return f"{value / NANOMETRE_M:.4g} nm"
+
+
+COMMANDS = (
+    Command(
+        "difference",
+        "do two measurements of one part agree? E_n, maps, verdict",
+        _declare_difference,
+        _difference,
+        _show_difference,
+    ),
+)

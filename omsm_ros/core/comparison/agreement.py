@@ -1,0 +1,248 @@
+"""Do two measurements agree within what both of them state?
+
+``E_n = (a − b) / √(U_a² + U_b²)`` with expanded uncertainties (ISO 13528, 9.7): beyond ±1 they
+disagree. For one figure U has k = 2. Where many are judged together, as the Zernike terms, one of
+twenty would be beyond ±1 with nothing wrong; their U holds for all of them at once with 95 %
+(Šidák), and the whole is judged by ``χ² = cᵀ C⁻¹ c`` with all their covariances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.special import chdtrc, ndtri
+
+from omsm_ros.core.comparison.matching import Matched
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
+
+COVERAGE_FACTOR = 2.0
+TERMS: tuple[Term, ...] = terms_up_to(6, 2)
+ROBUST_SHARE = 0.995
+
+_TOGETHER = 0.95
+_DRAWS = 300
+# Above it the width of the filter is no whole place.
+_HARDLY_SMOOTHED = 0.7
+# A term of which the others explain all but this share is not told from them.
+_LEAST_OWN_SHARE = 1e-4
+_PERCENTILE = 99.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """What one measurement may be wrong by at the places (m,).
+
+    shapes: by source, each (k, m) [m], sizes independent with standard deviation one
+    single: independent standard deviation of each height [m], (m,)
+    averaged: the same for means over many places, to which it adds in squares [m], (m,)
+    """
+
+    shapes: dict[str, FloatArray]
+    single: FloatArray
+    averaged: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A figure of both measurements [m], and its E_n; expanded and e_n None: not evaluated."""
+
+    a: float
+    b: float
+    expanded: float | None
+    e_n: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class TermNumber:
+    """A Zernike term of the difference [m], one at the rim; expanded for all terms at once."""
+
+    n: int
+    m: int
+    difference: float
+    uncertainty: float
+    expanded: float
+    e_n: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Agreement:
+    """E_n of what two measurements were compared in.
+
+    figures: peak_to_valley, robust_peak_to_valley, rms
+    terms: of the difference;  probability: of a χ² as large, if only the stated errors were there
+    within: share of the area where |E_n| < 1 (k = 2)
+    uncertainty: of the difference at each place [m], k = 1, (m,)
+    farthest: largest |difference| / uncertainty of all places;  allowed: 99 % of pairs without a
+        true difference stay below;  at: its place [m]
+    aperture: radius and middle of the disc of the terms [m]
+    """
+
+    figures: dict[str, Number]
+    terms: tuple[TermNumber, ...]
+    probability: float
+    within: float
+    uncertainty: FloatArray
+    farthest: float
+    allowed: float
+    at: tuple[float, float]
+    aperture: tuple[float, float, float]
+
+    @property
+    def largest(self) -> TermNumber:
+        """The term of the largest |E_n|."""
+        return max(self.terms, key=lambda term: abs(term.e_n))
+
+
+def peak_to_valley(values: FloatArray) -> FloatArray:
+    """Largest less smallest of values (…, m)."""
+    return np.asarray(np.ptp(values, axis=-1))
+
+
+def robust_peak_to_valley(values: FloatArray) -> FloatArray:
+    """Span of the middle 99.5 % of values (…, m)."""
+    tail = 50 * (1 - ROBUST_SHARE)
+    low, high = np.percentile(values, [tail, 100 - tail], axis=-1)
+    return np.asarray(high - low)
+
+
+def root_mean_square(values: FloatArray) -> FloatArray:
+    """Rms of values (…, m) about zero."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
+
+
+FIGURES: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "peak_to_valley": peak_to_valley,
+    "robust_peak_to_valley": robust_peak_to_valley,
+    "rms": root_mean_square,
+}
+
+
+def figures_of(matched: Matched) -> dict[str, Number]:
+    """Return the figures of both measurements less the fitted freedoms, without any E_n."""
+    a, b = matched.without_fit(np.stack([matched.a, matched.b]))
+    return {
+        name: Number(float(figure(a)), float(figure(b)), None, None)
+        for name, figure in FIGURES.items()
+    }
+
+
+def shapes_of_difference(errors: tuple[Errors, Errors], shared: Collection[str] = ()) -> FloatArray:
+    """Return the shapes (k, m) [m] of what a − b may be wrong by.
+
+    shared: sources of one and the same error in both, so that its two shapes are subtracted
+    """
+    own = [rows for e in errors for name, rows in e.shapes.items() if name not in shared]
+    both = [errors[0].shapes[name] - errors[1].shapes[name] for name in shared]
+    return np.concatenate([np.empty((0, len(errors[0].single))), *own, *both])
+
+
+def judge(
+    matched: Matched, errors: tuple[Errors, Errors], shared: Collection[str] = ()
+) -> Agreement:
+    """Return how two measurements agree whose errors at the places are known.
+
+    shared: sources of one and the same error in both
+    """
+    shapes = matched.without_fit(shapes_of_difference(errors, shared))
+    uncertainty = np.sqrt(np.sum(shapes**2, axis=0) + sum(e.single**2 for e in errors))
+    score = np.abs(matched.difference) / uncertainty
+    worst = int(np.argmax(score))
+    averaged = np.hypot(errors[0].averaged, errors[1].averaged)
+    terms, probability, aperture = _terms(matched, shapes, averaged)
+    drawn = _drawn(matched, errors, shared)
+    farthest = np.max(np.abs(drawn[0] - drawn[1]) / uncertainty, axis=1)
+    return Agreement(
+        figures=_figures(matched, drawn),
+        terms=terms,
+        probability=probability,
+        within=float(np.mean(score < COVERAGE_FACTOR)),
+        uncertainty=uncertainty,
+        farthest=float(score[worst]),
+        allowed=float(np.percentile(farthest, _PERCENTILE)),
+        at=(float(matched.x[worst]), float(matched.y[worst])),
+        aperture=aperture,
+    )
+
+
+def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]:
+    """Figures with the scatter that the errors give them, by Monte Carlo (GUM supplement 1)."""
+    plain = figures_of(matched)
+    heights = matched.without_fit(np.stack([matched.a, matched.b]))
+    found = {}
+    for name, figure in FIGURES.items():
+        runs = [figure(own + errors) for own, errors in zip(heights, drawn, strict=True)]
+        spread = float(np.std(runs[0] - runs[1]))
+        # Noise widens a peak to valley: by as much as one more noise does, of each its own.
+        own = (plain[name].a, plain[name].b)
+        excess = [float(np.mean(run)) - value for run, value in zip(runs, own, strict=True)]
+        expanded = COVERAGE_FACTOR * spread
+        e_n = ((own[0] - excess[0]) - (own[1] - excess[1])) / expanded if expanded > 0 else None
+        found[name] = Number(*own, expanded, e_n)
+    return found
+
+
+def _drawn(
+    matched: Matched, errors: tuple[Errors, Errors], shared: Collection[str]
+) -> list[FloatArray]:
+    """Errors of both, each (draws, m) [m]; the same for the same input."""
+    random = np.random.default_rng(0)
+    made = [_noise(matched, side, random) for side in errors]
+    common: dict[str, FloatArray] = {}
+    for place, side in enumerate(errors):
+        for name, rows in side.shapes.items():
+            sizes = random.standard_normal((_DRAWS, len(rows)))
+            if name in shared:
+                sizes = common.setdefault(name, sizes)
+            made[place] = made[place] + sizes @ matched.without_fit(rows)
+    return made
+
+
+def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> FloatArray:
+    """Independent errors as the local fits pass them on (draws, m) [m].
+
+    Places share points with their neighbours: so much smoothed, white noise of the size of means
+    has the size of single heights. A Gaussian of width σ leaves 1 / 4πσ² of the variance.
+    """
+    ratio = float(np.median(side.single / side.averaged)) ** 2
+    width = np.sqrt(1 / (4 * np.pi * min(ratio, 1.0)))
+    shape = matched.grid.height.shape
+    made = np.empty((_DRAWS, len(side.single)))
+    for draw in made:
+        white = random.standard_normal(shape)
+        smooth = gaussian_filter(white, width, mode="wrap") if ratio < _HARDLY_SMOOTHED else white
+        draw[:] = smooth.ravel()[matched.filled]
+    return made * side.single / np.std(made)
+
+
+def _terms(
+    matched: Matched, fitted: FloatArray, averaged: FloatArray
+) -> tuple[tuple[TermNumber, ...], float, tuple[float, float, float]]:
+    """Zernike terms of the difference beside the fitted freedoms, and how likely they all are."""
+    x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
+    radius = float(np.max(np.hypot(matched.x - x0, matched.y - y0)))
+    u, v = (matched.x - x0) / radius, (matched.y - y0) / radius
+    names, rows = _rows(matched, zernike_values(u, v, TERMS))
+    value = rows @ matched.difference
+    shapes = fitted @ rows.T
+    covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
+    spread = np.sqrt(np.diag(covariance))
+    whitened = np.linalg.solve(covariance / np.outer(spread, spread), value / spread)
+    factor = float(ndtri((1 + _TOGETHER ** (1 / len(names))) / 2))
+    terms = tuple(
+        TermNumber(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
+        for term, d, s in zip(names, value, spread, strict=True)
+    )
+    return terms, float(chdtrc(len(names), whitened @ (value / spread))), (radius, x0, y0)
+
+
+def _rows(matched: Matched, values: FloatArray) -> tuple[list[Term], FloatArray]:
+    """Terms that the fitted freedoms leave to be told, and the weights (t, m) of the places."""
+    free = matched.without_fit(values)
+    own = np.linalg.norm(free, axis=1) / np.linalg.norm(values, axis=1)
+    kept = np.flatnonzero(own > _LEAST_OWN_SHARE)
+    design = free[kept].T
+    return [TERMS[k] for k in kept], np.asarray(np.linalg.pinv(design, rcond=1e-8), np.float64)

@@ -1,0 +1,187 @@
+"""Two measurements of one part: matched, subtracted, judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.comparison.agreement import Agreement, Errors, judge
+from omsm_ros.core.comparison.cells import cell_side
+from omsm_ros.core.comparison.matching import SEATED, Matched, match
+from omsm_ros.core.comparison.resampling import LocalQuadratic
+from omsm_ros.core.comparison.stated_errors import (
+    ESTIMATED,
+    NOT_KNOWN,
+    Half,
+    Measurement,
+    drift_size,
+    errors_of,
+)
+from omsm_ros.core.comparison.verdict import Verdict, verdict_of
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.errors import DataError
+from omsm_ros.units import NANOMETRE_M
+
+MOST_ACROSS = 200
+"""Places across the map of a difference."""
+
+# Of the radius: an error of a form that nobody knows is correlated over it, which makes most of
+# it the terms of low order that a comparison looks at.
+_CORRELATED_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Side:
+    """What a measurement brought to the comparison, lengths [m].
+
+    scatter: of a point about its neighbours
+    sources: rms over the places of each systematic error, by source; None: not known
+    drift: standard deviation where it is largest;  drift_from: who knows it
+    interpolation: rms error between the points, from above;  cell: of the local fits
+    """
+
+    name: str
+    points: int
+    scatter: float
+    sources: dict[str, float] | None
+    drift: float
+    drift_from: str
+    interpolation: float
+    cell: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Comparison:
+    """matched: both at the same places;  agreement: None if an uncertainty is not known
+    shared: of the smaller area, the share that both cover
+    length: over which errors of unknown form are taken for correlated [m]
+    common: sources of one and the same error in both
+    """
+
+    matched: Matched
+    sides: tuple[Side, Side]
+    agreement: Agreement | None
+    shared: float
+    length: float
+    common: tuple[str, ...]
+    verdict: Verdict
+
+
+def compare(
+    a: Measurement,
+    b: Measurement,
+    freedoms: Sequence[str] = SEATED,
+    spacing: float | None = None,
+    length: float | None = None,
+) -> Comparison:
+    """Compare two measurements of one part, the second moved onto the first by ``freedoms``.
+
+    spacing: of the places [m], None: as the coarser of both allows
+    length: over which errors of unknown form are correlated [m], None: half the radius
+
+    Raises DataError where they share too little, or are no areas.
+    """
+    cells = [cell_side(m.points.x, m.points.y, MOST_ACROSS) for m in (a, b)]
+    side = spacing or max(cells)
+    first, second = (
+        LocalQuadratic(m.points, max(c, side)) for m, c in zip((a, b), cells, strict=True)
+    )
+    matched = match(first, second, _places(a.points, b.points, side), freedoms)
+    halves = (
+        Half(a, first, matched.from_a, matched.x, matched.y,
+             first.method_error(matched.x, matched.y)),
+        Half(b, second, matched.from_b, matched.b_x, matched.b_y,
+             second.method_error(matched.b_x, matched.b_y)),
+    )  # fmt: skip
+    reach = length or _CORRELATED_SHARE * float(max(np.ptp(matched.x), np.ptp(matched.y))) / 2
+    (one, other), common = errors_of(halves, matched, reach)
+    agreement = None
+    if one is not None and other is not None:
+        agreement = judge(matched, (one, other), common)
+    unknown = tuple(
+        f"{half.measurement.name} carries no uncertainty; state it, as --uncertainty 5e-9"
+        for half, errors in zip(halves, (one, other), strict=True)
+        if errors is None
+    )
+    sides = (_side(halves[0], one, agreement), _side(halves[1], other, agreement))
+    shared = _shared(a.points, b.points, matched, side)
+    reservations = _reservations(sides, matched)
+    return Comparison(
+        matched=matched,
+        sides=sides,
+        agreement=agreement,
+        shared=shared,
+        length=reach,
+        common=common,
+        verdict=verdict_of(matched, agreement, unknown, shared, reservations),
+    )
+
+
+def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
+    """Return a grid over what both may cover."""
+    low = [max(float(v.min()), float(w.min())) for v, w in ((a.x, b.x), (a.y, b.y))]
+    high = [min(float(v.max()), float(w.max())) for v, w in ((a.x, b.x), (a.y, b.y))]
+    if low[0] >= high[0] or low[1] >= high[1]:
+        raise DataError(
+            "the two measurements do not overlap; do they lie in one frame, and in one unit?"
+        )
+    counts = [int((h - c) / side) + 1 for c, h in zip(low, high, strict=True)]
+    if max(counts) > 20 * MOST_ACROSS:
+        raise DataError(f"a spacing of {side:.3g} m makes {counts!r} places; widen it")
+    x0, y0 = (c + (h - c) % side / 2 for c, h in zip(low, high, strict=True))
+    return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
+
+
+def _side(half: Half, errors: Errors | None, agreement: Agreement | None) -> Side:
+    sources = None
+    if errors is not None:
+        sources = {
+            name: float(np.sqrt(np.mean(np.sum(rows**2, axis=0))))
+            for name, rows in errors.shapes.items()
+        }
+    m = half.measurement
+    estimated = m.drift_from == ESTIMATED and agreement is None
+    return Side(
+        name=m.name,
+        points=len(m.points),
+        scatter=half.surface.scatter,
+        sources=sources,
+        drift=drift_size(errors),
+        drift_from=NOT_KNOWN if estimated else m.drift_from,
+        interpolation=half.interpolation,
+        cell=half.surface.cell,
+    )
+
+
+def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]:
+    found: tuple[str, ...] = ()
+    drifts = [side.drift for side in sides if side.drift_from == ESTIMATED]
+    if any(drifts):
+        found = (
+            f"nobody states the drift: what of the difference goes with the time of a scan, up to "
+            f"{max(drifts) / NANOMETRE_M:.1f} nm, is taken for it; a true difference of that form, "
+            "as rings or power of a spiral scan, is not seen; state it, as --drift 20e-9",
+        )
+    sideways = [name for name in ("x", "y", "clocking") if name in matched.freedoms]
+    if sideways:
+        found += (
+            f"{', '.join(sideways)} were fitted: a true difference that looks like such a move is "
+            "not seen",
+        )
+    return found + tuple(f"{name} was not fitted: {why}" for name, why in matched.refused.items())
+
+
+def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:
+    """Of the smaller area, the share that both cover."""
+    both = float(np.sum(matched.filled)) * side**2
+    return min(both / min(_area(points, side) for points in (a, b)), 1.0)
+
+
+def _area(points: MeasuredPoints, side: float) -> float:
+    """Area that the points cover [m²], by cells of ``side`` that hold any."""
+    column, row = (np.floor(v / side).astype(np.int64) for v in (points.x, points.y))
+    cells = np.unique((column - column.min()) * (int(np.ptp(row)) + 1) + row - row.min())
+    return len(cells) * side**2

@@ -1,0 +1,80 @@
+"""In which shapes may a measurement be wrong as a whole?
+
+Noise averages out over an area; a drift, a reference surface or a filter that is a little wrong
+does not. Such an error is a sum of shapes over the surface, each with an independent size of
+standard deviation one (Karhunen and Loève): a shape then is what it does to every height [m].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from omsm_ros.core.correction.unknown_curves import components, random_walk
+from omsm_ros.core.samples.blocks import FloatArray
+
+_NODES = 400
+_LEFT_OUT = 0.005
+_DRIFTS_M = np.geomspace(1e-11, 1e-5, 121)
+
+
+def unknown_form(x: FloatArray, y: FloatArray, size: FloatArray, length: float) -> FloatArray:
+    """Return the shapes (k, m) of an error of standard deviation ``size`` (m,) [m] at x, y (m,).
+
+    Its covariance falls with the distance d as ``exp(−d² / 2 length²)``. The shapes are found on
+    some of the places and carried to the others (Nyström), and scaled to the full variance.
+    """
+    if len(x) == 0 or not np.any(size > 0):
+        return np.empty((0, len(x)))
+    some = np.linspace(0, len(x) - 1, min(_NODES, len(x))).astype(np.int64)
+    nodes = np.column_stack([x[some], y[some]])
+    values, vectors = np.linalg.eigh(_kernel(nodes, nodes, length))
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    share = np.cumsum(values) / values.sum()
+    kept = int(np.searchsorted(share, 1 - _LEFT_OUT)) + 1
+    carried = _kernel(np.column_stack([x, y]), nodes, length) @ (
+        vectors[:, :kept] / np.sqrt(values[:kept])
+    )
+    found = np.linalg.norm(carried, axis=1, keepdims=True)
+    return np.asarray((size[:, np.newaxis] * carried / np.maximum(found, 1e-9)).T, np.float64)
+
+
+def _kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
+    square = np.sum((one[:, np.newaxis] - other[np.newaxis]) ** 2, axis=2)
+    return np.asarray(np.exp(-square / (2 * length**2)), np.float64)
+
+
+def drift(order: FloatArray, size: float) -> FloatArray:
+    """Return the shapes (k, m) of a random walk in time that scatters by ``size`` [m] at its end.
+
+    order: time of each place (m,), 0 at the beginning of the scan and 1 at its end
+    """
+    return np.asarray(size * components(random_walk, order), np.float64)
+
+
+def likely_drift(
+    difference: FloatArray, known: FloatArray, noise: FloatArray, drifts: FloatArray
+) -> float:
+    """Return the size of a drift of which nobody knows how large it was [m], from a difference.
+
+    difference: (m,) [m];  known: shapes of the other errors (k, m) [m]
+    noise: independent standard deviation of each place (m,) [m]
+    drifts: shapes for a size of one metre (l, m)
+
+    It is the most likely size of ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ drifts)``,
+    and so holds whatever of the difference goes along with the time of the scans.
+    """
+    some = np.linspace(0, len(difference) - 1, min(_NODES, len(difference))).astype(np.int64)
+    shapes = known[:, some]
+    covariance = shapes.T @ shapes + np.diag(noise[some] ** 2 + (1e-12) ** 2)
+    root = cholesky(covariance, lower=True)
+    data = solve_triangular(root, difference[some], lower=True)
+    walked = solve_triangular(root, drifts[:, some].T, lower=True)
+    values, vectors = np.linalg.eigh(walked.T @ walked)
+    values = np.maximum(values, 0.0)
+    square = (vectors.T @ (walked.T @ data)) ** 2
+    sizes = np.concatenate([[0.0], _DRIFTS_M])
+    likelihood = [
+        np.sum(square * s**2 / (1 + s**2 * values)) - np.sum(np.log1p(s**2 * values)) for s in sizes
+    ]
+    return float(sizes[int(np.argmax(likelihood))])

@@ -1,0 +1,138 @@
+"""Agree, differ, or cannot tell; and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.comparison.agreement import Agreement, root_mean_square
+from omsm_ros.core.comparison.matching import Matched
+from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
+
+AGREE, DIFFER, CANNOT_TELL = "agree", "differ", "cannot tell"
+
+# Of pairs that agree one in a hundred may look as unlikely.
+_LEAST_PROBABILITY = 0.01
+# What is beyond one but not by this is as well chance as a difference.
+_PLAINLY_BEYOND = 1.25
+_LEAST_SHARED = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: for it, the weightiest first
+    reservations: what it rests on beside the stated uncertainties
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    reservations: tuple[str, ...]
+
+
+def verdict_of(
+    matched: Matched,
+    agreement: Agreement | None,
+    unknown: tuple[str, ...],
+    shared: float,
+    reservations: tuple[str, ...],
+) -> Verdict:
+    """Return the verdict.
+
+    agreement: None if the uncertainty of a measurement is not known;  unknown: why
+    shared: of the smaller area, the share that both cover
+    """
+    if shared < _LEAST_SHARED:
+        unknown += (f"they share {100 * shared:.0f} % of the smaller area, expected 50 % or more",)
+    if agreement is None or shared < _LEAST_SHARED:
+        return Verdict(CANNOT_TELL, unknown, reservations)
+    differs = _differences(agreement)
+    if differs:
+        return Verdict(DIFFER, differs, reservations)
+    doubts = _doubts(matched, agreement)
+    if doubts:
+        return Verdict(CANNOT_TELL, doubts, reservations)
+    largest = agreement.largest
+    return Verdict(
+        AGREE,
+        (
+            f"all {len(agreement.terms)} Zernike terms: the largest |E_n| is "
+            f"{abs(largest.e_n):.2f}, of {_named(largest.n, largest.m)}",
+            f"a difference like theirs or larger has a probability of {agreement.probability:.2g}",
+            f"|E_n| < 1 on {100 * agreement.within:.1f} % of the area",
+            "what may differ unseen, term by term: up to " + _least_sure(agreement),
+        ),
+        reservations,
+    )
+
+
+def _least_sure(found: Agreement) -> str:
+    """The terms of the largest uncertainty, with it."""
+    terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
+    return ", ".join(f"{t.expanded / NANOMETRE_M:.1f} nm of {_named(t.n, t.m)}" for t in terms)
+
+
+def _differences(found: Agreement) -> tuple[str, ...]:
+    reasons = []
+    largest = found.largest
+    if abs(largest.e_n) > _PLAINLY_BEYOND:
+        reasons.append(
+            f"{_named(largest.n, largest.m)} differs by {largest.difference / NANOMETRE_M:.2f} nm "
+            f"where {largest.expanded / NANOMETRE_M:.2f} nm are explained: E_n = {largest.e_n:.2f}"
+        )
+    if found.probability < _LEAST_PROBABILITY:
+        reasons.append(
+            f"all terms together: a probability of {found.probability:.1g} if only the stated "
+            "errors were there"
+        )
+    if found.farthest > _PLAINLY_BEYOND * found.allowed:
+        x, y = (place / MILLIMETRE_M for place in found.at)
+        reasons.append(
+            f"at x {x:.2f} mm, y {y:.2f} mm they differ by {found.farthest:.1f} standard "
+            f"uncertainties, where {found.allowed:.1f} are the most to expect of all places"
+        )
+    reasons += [
+        f"{name.replace('_', ' ')}: E_n = {number.e_n:.2f}"
+        for name, number in found.figures.items()
+        if number.e_n is not None and abs(number.e_n) > _PLAINLY_BEYOND and reasons
+    ]
+    return tuple(reasons)
+
+
+def _doubts(matched: Matched, found: Agreement) -> tuple[str, ...]:
+    beyond = {_named(t.n, t.m): t.e_n for t in found.terms if abs(t.e_n) > 1}
+    beyond |= {
+        name.replace("_", " "): number.e_n
+        for name, number in found.figures.items()
+        if number.e_n is not None and abs(number.e_n) > 1
+    }
+    doubts = [
+        f"{name} has E_n = {value:.2f}, too little beyond 1 to tell"
+        for name, value in beyond.items()
+    ]
+    deviation = matched.without_fit(np.stack([matched.a, matched.b]))
+    compared = float(np.max(root_mean_square(deviation)))
+    explained = 2 * float(root_mean_square(found.uncertainty))
+    if explained > compared:
+        doubts.append(
+            f"an uncertainty of {explained / NANOMETRE_M:.1f} nm (k = 2) is more than all that is "
+            f"compared, {compared / NANOMETRE_M:.1f} nm rms; measure with less"
+        )
+    return tuple(doubts)
+
+
+_NAMES = {
+    (2, 0): "power",
+    (2, 2): "astigmatism",
+    (2, -2): "oblique astigmatism",
+    (3, 1): "coma in x",
+    (3, -1): "coma in y",
+    (3, 3): "trefoil",
+    (3, -3): "oblique trefoil",
+    (4, 0): "spherical aberration",
+}
+
+
+def _named(n: int, m: int) -> str:
+    term = f"Z({n}, {m})"
+    return f"{_NAMES[n, m]} {term}" if (n, m) in _NAMES else term
