@@ -18,8 +18,8 @@ from omsm_ros.jobs.compare_measurements import (
     compare_measurements,
     write_difference,
 )
-from omsm_ros.storage.machine_files import load_surface
 from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import NANOMETRE_M
 
 # ---------------------------------------------------------------------------- difference
