@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -45,6 +46,12 @@ def show(row: Row) -> None:
     )
 
 
+def _processor_time() -> float:
+    """Seconds that this process and those it waited for have taken."""
+    took = os.times()
+    return took.user + took.system + took.children_user + took.children_system
+
+
 def main() -> int:
     """Run the parts asked for, all by default."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -58,11 +65,12 @@ def main() -> int:
     found: list[Row] = []
     print(f"{'':6}{'figure':72}{'runs':>5}{'value':>12} {'':6}{'bar':16}peer")
     for part in args.parts:
-        begin = time.monotonic()
+        begin, used = time.monotonic(), _processor_time()
         for row in importlib.import_module(f"benchmarks.{part}").rows(args.full):
             found.append(row)
             show(row)
-        print(f"      {part}: {time.monotonic() - begin:.0f} s", flush=True)
+        wall, cpu = time.monotonic() - begin, _processor_time() - used
+        print(f"      {part}: {wall:.0f} s, {cpu:.0f} s of processor time", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     # JSON has no NaN: what could not be had is null.
     plain = [{k: None if v != v else v for k, v in row.items()} for row in found]

@@ -84,6 +84,7 @@ def test_samples_that_had_to_be_given_up_are_an_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
     monkeypatch.setattr(corrected_scan, "MOST_WAITING", 5000)
+    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = write(tmp_path / "ahead.mcap", small_scan_blocks, ahead=len(small_scan_blocks))
     with pytest.raises(BagError, match="waited for their partners in vain"):
         correct_bag(path, true_calibration, tmp_path / "cloud.ply")
@@ -94,6 +95,7 @@ def test_axes_that_go_on_without_the_probe_are_no_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
     monkeypatch.setattr(corrected_scan, "MOST_WAITING", 5000)
+    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = tmp_path / "stopped.mcap"
     with BagWriter(path, TOPICS) as writer:
         for k, (axes, distance) in enumerate(small_scan_blocks):

@@ -207,10 +207,17 @@ def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray
 
 def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
     """Return the convolution (n,), by FFT; true where the kernel lies inside the record."""
-    length = fast_length(len(values) + len(kernel) - 1)
-    product = np.fft.rfft(values, length) * np.fft.rfft(kernel, length)
-    half = len(kernel) // 2
-    return np.asarray(np.fft.irfft(product, length)[half : half + len(values)])
+    # In stretches of eight kernels, each with the values that reach into it (overlap and save).
+    reach = len(kernel) - 1
+    length = min(fast_length(8 * len(kernel)), fast_length(len(values) + reach))
+    step = length - reach
+    stretches = -(-(len(values) + reach) // step)
+    padded = np.zeros(stretches * step + reach)
+    padded[reach : reach + len(values)] = values
+    rows = np.lib.stride_tricks.sliding_window_view(padded, length)[::step]
+    spectra = np.fft.rfft(rows) * np.fft.rfft(kernel, length)
+    whole = np.fft.irfft(spectra, length)[:, reach:].ravel()
+    return np.asarray(whole[reach // 2 : reach // 2 + len(values)])
 
 
 def _through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
@@ -223,8 +230,9 @@ def _running_mean(values: FloatArray, width: int) -> FloatArray:
     """Return the mean of the nearest ``width`` values, (n,)."""
     width = int(np.clip(width, 1, len(values)))
     total = np.concatenate([[0.0], np.cumsum(values)])
-    first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
-    return np.asarray(np.maximum(total[first + width] - total[first], 0.0) / width)
+    means = np.maximum(total[width:] - total[:-width], 0.0) / width
+    before = width // 2
+    return np.pad(means, (before, len(values) - len(means) - before), mode="edge")
 
 
 def _dynamics_limit(

@@ -16,10 +16,7 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 # Sixteen points a turn of the paper's scan and more: enough for what repeats eight times a turn.
 MOST_TRACED = 8192
 
-_COLUMNS = (
-    *("time", "x", "y", "height", "slide_x", "slide_y"),
-    *("z", "z_rate", "c", "distance"),
-)
+_COLUMNS = ("time", "x", "y", "height", "z", "z_rate", "c", "distance")
 
 
 class ScanTrace:
@@ -56,14 +53,11 @@ class ScanTrace:
             self._last = float(time[-1]) + self._late
             if not self.seen:
                 self._first_z = float(motion[0, 0])
-        cosine, sine = np.cos(c), np.sin(c)
         points = ScanPoints(
             time=time + self._late,
             x=where.x,
             y=where.y,
             height=where.height,
-            slide_x=where.x * cosine - where.y * sine,
-            slide_y=where.x * sine + where.y * cosine,
             z=motion[0] - self._first_z,
             z_rate=motion[1],
             c=c,
@@ -80,8 +74,9 @@ class ScanTrace:
 
     def _keep(self, points: ScanPoints) -> None:
         self.seen += len(points)
-        rows = [getattr(points, name) for name in _COLUMNS]
-        self._kept.add(np.stack([*rows, *points.dynamics]).T)
+        chosen = self._kept.chosen(len(points))
+        rows = [getattr(points, name)[chosen] for name in _COLUMNS]
+        self._kept.add_chosen(np.stack([*rows, *points.dynamics[:, chosen]]).T, len(points))
 
     def points(self) -> ScanPoints:
         """Return those kept, in the order of time."""

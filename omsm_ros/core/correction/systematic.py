@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
@@ -31,7 +33,6 @@ class ScanPoints:
     """Points of a scan in the order of time, each array (n,): what a sensitivity field looks at.
 
     time: since the start [s];  x, y, height: in the workpiece frame [m]
-    slide_x, slide_y: of the point from the spindle axis, in the machine frame [m]
     z: of the probe, H(z) [m];  z_rate: its rate [m/s];  c: angle of the spindle [rad]
     distance: that the probe measured, growing with height [m]
     slope_x, slope_y: of the surface along the workpiece's x and y [1]; None where it is not known
@@ -43,8 +44,6 @@ class ScanPoints:
     x: FloatArray
     y: FloatArray
     height: FloatArray
-    slide_x: FloatArray
-    slide_y: FloatArray
     z: FloatArray
     z_rate: FloatArray
     c: FloatArray
@@ -55,6 +54,21 @@ class ScanPoints:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def slide_x(self) -> FloatArray:
+        """Of the point from the spindle axis, along X of the machine [m], (n,)."""
+        return self._slides[0]
+
+    @property
+    def slide_y(self) -> FloatArray:
+        """Of the point from the spindle axis, along Y of the machine [m], (n,)."""
+        return self._slides[1]
+
+    @cached_property
+    def _slides(self) -> tuple[FloatArray, FloatArray]:
+        # Few sources ask for them, and a cosine costs as much as a filter.
+        return workpiece_xy(self.x, self.y, -self.c)
 
     def with_slopes(self, surface: Surface | None) -> ScanPoints:
         """Return the points with the slopes of the nominal ``surface``.

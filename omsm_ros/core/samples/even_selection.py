@@ -31,10 +31,17 @@ class EvenSelection:
 
     def add(self, rows: NDArray[Any]) -> None:
         """Take in the next ``rows`` (n, …)."""
-        part = rows[-self._seen % self._every :: self._every]
-        self._seen += len(rows)
+        self.add_chosen(rows[self.chosen(len(rows))].copy(), len(rows))
+
+    def chosen(self, rows: int) -> slice:
+        """Return which of the next ``rows`` are wanted, for whoever makes only those."""
+        return slice(-self._seen % self._every, rows, self._every)
+
+    def add_chosen(self, part: NDArray[Any], rows: int) -> None:
+        """Take in what :meth:`chosen` asked for, (k, …), of the next ``rows``."""
+        self._seen += rows
         if len(part):
-            self._parts.append(part.copy())
+            self._parts.append(part)
         while len(self) > self._most:
             self._halve()
 
