@@ -16,7 +16,7 @@ NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
-.PHONY: setup demo test lint bench soak lock clean distclean
+.PHONY: setup demo test lint bench soak docs lock clean distclean
 
 setup: $(PACKAGE)
 
@@ -39,6 +39,10 @@ bench: $(PEERS)
 
 soak: setup
 	$(RUN) python -m pytest -m soak --timeout=0
+
+# The manual, in out/docs.
+docs: setup
+	$(RUN) python -m sphinx -q -W --keep-going docs out/docs
 
 lock:
 	bootstrap/lock.sh

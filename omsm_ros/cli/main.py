@@ -63,7 +63,8 @@ def _commands(word: str) -> list[Command]:
     return [c for module in wanted for c in importlib.import_module(module).COMMANDS]
 
 
-def _parser(word: str) -> argparse.ArgumentParser:
+def parser_of(word: str) -> argparse.ArgumentParser:
+    """Return the parser of ``omsm``: with the command ``word``, or with all of them."""
     parser = OneLineParser(
         prog="omsm", description="Identify, correct and judge recorded measurements."
     )
@@ -105,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         own, passed_on = _split(given)
-        args = _parser(own[0]).parse_args(own)
+        args = parser_of(own[0]).parse_args(own)
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:

@@ -1,0 +1,38 @@
+"""How Sphinx makes the manual: ``make docs`` writes it to ``out/docs``."""
+
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+
+import generated  # noqa: E402 - it lies beside this file
+
+from omsm_ros import __version__  # noqa: E402
+
+project = "omsm_ros"
+author = "The omsm_ros developers"
+version = release = __version__
+extensions = ["myst_parser"]
+html_theme = "furo"
+html_title = f"omsm_ros {release}"
+html_static_path: list[str] = []
+exclude_patterns = ["_*"]
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 3
+# Python lexers know neither our YAML comments nor G-code; a block that is no language is plain.
+suppress_warnings = ["misc.highlighting_failure"]
+
+
+def outside_as_text(app, name, source):
+    """Links to folders and pages outside of docs/ serve in the repository; here they are text."""
+    source[0] = re.sub(
+        r"\[([^\]]+)\]\((?:\.\./)+(?:README|CHANGELOG|config)[^)]*\)", r"\1", source[0]
+    )
+
+
+def setup(app):
+    """Write the pages that come from the code before Sphinx reads any."""
+    generated.write(ROOT / "docs" / "reference")
+    app.connect("source-read", outside_as_text)

@@ -1,0 +1,112 @@
+"""Pages of the reference that come from the code: commands, parameters, messages, quantities."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import yaml
+
+from omsm_ros import quantities
+from omsm_ros.cli.main import parser_of
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def write(folder: Path) -> None:
+    """Write every generated page into ``folder``, leaving alone what did not change."""
+    folder.mkdir(exist_ok=True)
+    pages = {
+        "commands": commands(),
+        "parameters": parameters(),
+        "messages": messages(),
+        "quantities": ranges(),
+    }
+    for name, text in pages.items():
+        path = folder / f"{name}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def commands() -> str:
+    """Return a section for each word after ``omsm``, with its arguments."""
+    parser = parser_of("")
+    (words,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    lines = ["# Commands", "", "Exit status: 0 done, 2 bad input, 70 a defect of ours.", ""]
+    for name, sub in words.choices.items():
+        lines += [f"## omsm {name}", "", (sub.description or "").strip().capitalize() + ".", ""]
+        lines += ["```text", sub.format_usage().strip(), "```", ""]
+        rows = [_argument(a) for a in sub._actions if a.dest != "help"]
+        lines += ["| argument | meaning |", "|---|---|", *rows, ""]
+        if sub.epilog:
+            lines += [sub.epilog, ""]
+    return "\n".join(lines) + "\n"
+
+
+def _argument(action: argparse.Action) -> str:
+    names = ", ".join(f"`{option}`" for option in action.option_strings)
+    name = names or f"`{action.metavar or action.dest}`"
+    if names and action.metavar:
+        name += f" `{action.metavar}`"
+    text = " ".join((action.help or "").split())
+    if action.choices is not None and action.option_strings:
+        text += f" One of {', '.join(f'`{c}`' for c in action.choices)}."
+    usual = action.default
+    if action.option_strings and usual not in (None, "", False, argparse.SUPPRESS) and usual:
+        text += f" Default: `{usual}`."
+    return f"| {_cell(name)} | {_cell(text)} |"
+
+
+def parameters() -> str:
+    """Return the parameters of each node, as its file in ``config/`` explains them."""
+    lines = [
+        "# Parameters of the nodes",
+        "",
+        "Each file in `config/` has every parameter of a node.",
+    ]
+    for path in sorted((ROOT / "config").glob("*.yaml")):
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
+        if not any(isinstance(v, dict) and "ros__parameters" in v for v in content.values()):
+            continue
+        lines += ["", f"## {path.stem}", "", "```yaml", text.rstrip(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def messages() -> str:
+    """Return the messages and services of ``omsm_msgs``, as they are written."""
+    lines = ["# Messages and services"]
+    for path in sorted((ROOT / "msg_defs").glob("*/*.*")):
+        if path.suffix in (".msg", ".srv"):
+            text = path.read_text(encoding="utf-8").rstrip()
+            lines += [
+                "",
+                f"## omsm_msgs/{path.parent.name}/{path.stem}",
+                "",
+                "```text",
+                text,
+                "```",
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def ranges() -> str:
+    """Return what may come from outside: each quantity with its unit and range."""
+    lines = [
+        "# Quantities",
+        "",
+        "What comes from outside (messages, files, arguments) is held against this table.",
+        "",
+        "| quantity | unit | plausible | where it is not |",
+        "|---|---|---|---|",
+    ]
+    known = {q for q in vars(quantities).values() if isinstance(q, quantities.Quantity)}
+    for one in sorted(known, key=lambda q: (q.name, q.unit, q.low, q.high)):
+        cells = (one.name, one.unit or "1", one.range_text, one.remedy)
+        lines.append(f"| {' | '.join(_cell(c) for c in cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"\s+", " ", text).replace("|", "\\|")
