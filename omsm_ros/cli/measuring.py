@@ -12,6 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.fit_option import declare_fit, form_rows
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
@@ -24,7 +25,7 @@ from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
 from omsm_ros.storage.machine_files import load_geometry, load_limits
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
@@ -93,12 +94,15 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--override", action="store_true", help="use a calibration that does not belong; recorded"
     )
+    declare_fit(sub, None)
     declare_catalogue(sub)
 
 
 def _correct(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     nominal = load_surface(args.nominal) if args.nominal else None
+    if args.fit and nominal is None:
+        raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
     options = CorrectionOptions(
         polarity=args.polarity,
         accept_other_rate=args.override,
@@ -106,7 +110,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         geometry=geometry_of(args.geometry),
     )
     with (
-        result_folder(args.out, (CLOUD, SYSTEMATIC, REPORT, SUMMARY)) as out,
+        result_folder(args.out, (CLOUD, SYSTEMATIC, DEVIATION, FORM, REPORT, SUMMARY)) as out,
         progress_bar("correcting", args.json) as progress,
     ):
         summary = measure(
@@ -120,6 +124,8 @@ def _correct(args: argparse.Namespace) -> Facts:
             by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
+            fit=args.fit,
+            aperture=args.aperture,
             report=not args.no_report,
             progress=progress,
         )
@@ -143,6 +149,8 @@ def _show_correct(summary: Facts) -> None:
     rows.append((light["level"], light["word"]))
     rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
     rows += [("warning", text) for text in summary.get("warnings", [])]
+    if "form" in summary:
+        rows += form_rows(summary["form"])
     table([*rows, ("written", ", ".join(summary["files"].values()))])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,43 +10,44 @@ import numpy as np
 
 from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.surface.placement import FREEDOMS, Aperture, Portion
-from omsm_ros.errors import FileError
-from omsm_ros.storage.cloud_file import CloudFile
-from omsm_ros.storage.files import CLOUD
+from omsm_ros.core.surface.placement import FREEDOMS, Aperture
+from omsm_ros.jobs.measured_portions import Measurement
+from omsm_ros.storage.files import DEVIATION, FORM, save_json
+from omsm_ros.storage.maps.vertex_file import write_ply
 
-FORM = "form.json"
-_PORTION = 131_072
-
-
-def cloud_in(path: Path) -> Path:
-    """Return the cloud that ``path`` is, or that lies in this folder of results."""
-    cloud = path / CLOUD if path.is_dir() else path
-    if not cloud.is_file():
-        raise FileError(f"no cloud at {str(cloud)!r}; give one, or the folder of a measurement")
-    return cloud
+_NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
 
 
 def judge_form(
-    cloud: Path, surface: Surface, asked: Sequence[str], aperture: Aperture | None = None
-) -> Form:
-    """Register a cloud to its nominal ``surface`` and judge its form, in bounded memory.
+    measured: Measurement,
+    surface: Surface,
+    out: Path,
+    asked: Sequence[str],
+    aperture: Aperture | None = None,
+) -> dict[str, Any]:
+    """Register a measurement to its nominal ``surface``; return what ``form.json`` says of it.
 
-    asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
+    Writes form.json and deviation.ply into ``out``: deviation along the normal over the part's x
+    and y. asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
 
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
-    opened = CloudFile(cloud)
+    form = analyse_form(
+        surface, measured.portions, asked, sources=measured.sources, aperture=aperture
+    )
+    facts = form_facts(form, measured)
+    save_json(out / FORM, facts)
+    write_ply(out / DEVIATION, _deviations(form))
+    return facts
 
-    def portions() -> Iterator[Portion]:
-        for rows in opened.portions(_PORTION):
-            x, y, height = (rows[name].astype(np.float64) for name in ("x", "y", "height"))
-            yield Portion(x, y, height, np.empty((0, len(x))))
 
-    return analyse_form(surface, portions, asked, aperture=aperture)
+def _deviations(form: Form) -> np.ndarray[Any, np.dtype[np.void]]:
+    table = np.empty(len(form.map), [(name, "<f8") for name in "xyz"])
+    table["x"], table["y"], table["z"] = form.map.x, form.map.y, form.map.deviation
+    return table
 
 
-def form_facts(form: Form) -> dict[str, Any]:
+def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
     """Return the content of ``form.json``; lengths in metres, angles in radians."""
     found = form.registration
     placement = found.placement
@@ -64,7 +65,8 @@ def form_facts(form: Form) -> dict[str, Any]:
                 source: dict(zip(found.freedoms.fitted, map(float, shares), strict=True))
                 for source, shares in found.from_source.items()
             },
-            "not_evaluated": ["systematic sources of uncertainty"],
+            "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
+            "notes": list(measured.notes),
         },
         "aperture": {
             "radius": form.aperture.radius,

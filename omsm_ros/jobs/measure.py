@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -20,12 +21,13 @@ from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.judge_scan import Judgement, with_sources
 from omsm_ros.jobs.read_bag import Progress, no_progress
-from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
+from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, save_json
 
 
 def measure(
@@ -40,6 +42,8 @@ def measure(
     by_stamps: ByStamps | None = None,
     stated: MachineSources = NOTHING_STATED,
     accuracy: float | None = None,
+    fit: Sequence[str] | None = None,
+    aperture: Aperture | None = None,
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -50,6 +54,8 @@ def measure(
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
+    fit: freedoms in which the points are registered to ``nominal``; None: they are not;  aperture:
+        of the part, within which they are
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
@@ -67,6 +73,8 @@ def measure(
         progress=progress,
     )
     summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out))
+    if fit is not None and nominal is not None and done.statistics:
+        _judge_form(out, summary, nominal, fit, aperture)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
@@ -77,6 +85,23 @@ def measure(
         figures = figures_of(done.points, calibration, nominal, done.sample_period)
         publish(out, f"Surface of {bag.name}", summary, calibration, figures)
     return summary
+
+
+def _judge_form(
+    out: Path,
+    summary: dict[str, Any],
+    nominal: Surface,
+    fit: Sequence[str],
+    aperture: Aperture | None,
+) -> None:
+    """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
+    # Here, because most corrections do without.
+    from omsm_ros.jobs.judge_form import judge_form
+    from omsm_ros.jobs.measured_portions import open_measurement
+
+    facts = judge_form(open_measurement(out), nominal, out, fit, aperture)
+    summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
+    summary["files"] |= {"form": FORM, "deviation": DEVIATION}
 
 
 def summarise(

@@ -70,6 +70,30 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     }
 
 
+def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
+    arguments = ["correct", folder / "scan.mcap", "--calibration", folder / "cal.json",
+                 "--out", tmp_path, "--nominal", folder / "mirror.yaml", "--fit", "piston,tip,tilt",
+                 "--json"]  # fmt: skip
+    status, text, _ = run(capsys, *arguments)
+    assert status == 0
+    summary = json.loads(text)
+    found = json.loads((tmp_path / "form.json").read_text())
+    assert summary["form"]["deviation"] == found["deviation"]
+    assert found["removed"]["not_evaluated"] == []
+    assert found["points"]["read"] == summary["samples"]["distance"]["corrected"]
+    assert found["deviation"]["rms"]["value"] < 15e-9
+    page = (tmp_path / "report.html").read_text()
+    assert "as it sits" in page
+    assert "registered" in page
+
+
+def test_a_fit_needs_a_surface(capsys, folder, tmp_path):
+    words = ["correct", folder / "scan.mcap", "--calibration", folder / "cal.json"]
+    status, _, err = run(capsys, *words, "--out", tmp_path, "--fit", "auto")
+    assert status == 2
+    assert "--nominal" in err
+
+
 def test_inspect_counts_what_is_there(capsys, folder):
     status, text, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0

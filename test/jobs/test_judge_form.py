@@ -1,16 +1,20 @@
 """From a cloud on disk to what ``form.json`` says."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from omsm_ros.cli.main import main
+from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.surface.freeforms import ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.storage.cloud_file import PlyWriter
-from omsm_ros.storage.files import CLOUD
+from omsm_ros.storage.cloud_file import CloudFile, PlyWriter
+from omsm_ros.storage.fields_file import save_fields
+from omsm_ros.storage.files import CLOUD, SYSTEMATIC
+from omsm_ros.storage.maps.read_map import read_points
 from omsm_ros.twin.part_pose import PartPose, posed
 
 RADIUS, POINTS = 12.7e-3, 40_000
@@ -128,3 +132,52 @@ def test_a_folder_without_a_cloud_is_named(tmp_path, folder, capsys):
     nominal = str(folder / "mirror.yaml")
     assert main(["form", str(tmp_path), "--nominal", nominal, "--out", str(tmp_path / "o")]) == 2
     assert "no cloud at" in capsys.readouterr().err
+
+
+def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
+    """20 nm of astigmatism that the instrument may have, in the fields beside the cloud."""
+    known = tmp_path / "known"
+    shutil.copytree(folder, known)
+    cloud = CloudFile(known / CLOUD).read()
+    u, v = (np.float64(cloud[name][::10]) / RADIUS for name in ("x", "y"))
+    save_fields(
+        known / SYSTEMATIC,
+        ScanFields(("spindle", "spindle"), 20e-9 * np.stack([u**2 - v**2, 3 * u / 20]), 10),
+    )
+    words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
+    plain = json.loads(form(folder, tmp_path / "a", *words)[1].read_text())
+    told = json.loads(form(known, tmp_path / "b", *words)[1].read_text())
+    assert told["removed"]["not_evaluated"] == []
+    assert plain["removed"]["not_evaluated"]
+    before, after = (
+        {(t["n"], t["m"]): t["uncertainty"] for t in found["zernike"]} for found in (plain, told)
+    )
+    assert after[2, 2] == pytest.approx(20e-9, rel=0.02)
+    assert after[3, 3] == pytest.approx(before[3, 3], rel=0.5)
+    # A tilt of the instrument goes into the pose, and leaves the form.
+    spindle = told["removed"]["pose_uncertainty"]["spindle"]
+    assert spindle["tilt"] == pytest.approx(3e-9 / RADIUS, rel=0.02)
+    for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
+        assert told["deviation"][name]["uncertainty"] > plain["deviation"][name]["uncertainty"]
+
+
+def test_the_deviations_are_left_for_other_programs(folder, tmp_path):
+    """As a map over the part, which our own reader takes like any other."""
+    _, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
+    left = read_points(tmp_path / "deviation.ply")
+    assert len(left.x) == json.loads(path.read_text())["points"]["used"]
+    off = left.height - Mirror.error.height(left.x, left.y)
+    assert np.std(off) == pytest.approx(1e-8, rel=0.05)
+
+
+def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
+    """Text in millimetres and nanometres; what it cannot tell is not evaluated."""
+    cloud = CloudFile(folder / CLOUD).read()[::4]
+    text = np.stack([cloud["x"] * 1e3, cloud["y"] * 1e3, cloud["height"] * 1e9], axis=1)
+    np.savetxt(tmp_path / "map.xyz", text, fmt="%.9g")
+    words = ["form", tmp_path / "map.xyz", "--nominal", folder / "mirror.yaml", "--unit", "mm,nm"]
+    words += ["--out", tmp_path / "out", "--fit", "piston,tip,tilt"]
+    assert main([str(word) for word in words]) == 0
+    found = json.loads((tmp_path / "out" / "form.json").read_text())
+    assert found["points"]["read"] == len(cloud)
+    assert found["pose"]["tip"]["value"] == pytest.approx(2e-3, abs=1e-7)

@@ -302,7 +302,8 @@ def _over_all(
     moved = gain @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
     by_source = {"noise and form": np.sqrt(np.diag(covariance))}
-    by_source |= {name: np.abs(moved[:, k]) for k, name in enumerate(sources)}
+    for k, name in enumerate(sources):  # of one source there may be several independent effects
+        by_source[name] = np.hypot(by_source.get(name, 0.0), moved[:, k])
     by_source |= {name: np.sqrt(np.sum(moves**2, axis=0)) for name, moves in unknown.items()}
     together = np.vstack([moved.T, *unknown.values()])
     return Registration(

@@ -47,6 +47,11 @@ def error_table(summary: Mapping[str, object]) -> Table:
         both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
         label = f"dynamic error, {_FIGURE_NAMES[key].split(',')[0]}"
         rows.append((label, *(quantity(v, "m") for v in both)))
+    for key in ("rms_before_fit", "rms"):
+        value = part(summary, "form", "deviation", key)
+        label = {"rms_before_fit": "as it sits", "rms": "registered"}[key]
+        found = () if value is None else (measured(value["value"], value["uncertainty"], "m"),)
+        rows += [(f"deviation from nominal along the normal, rms, {label}", "", *found)]
     for key in ("median", "largest"):
         value = part(summary, "uncertainty", key)
         rows.append((f"standard uncertainty of a height, {key}", "", quantity(value, "m")))

@@ -1,0 +1,82 @@
+"""The options of a registration, and how its result is told: form, correct."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from omsm_ros import quantities
+from omsm_ros.cli.command import Facts
+from omsm_ros.core.surface.freedoms import parsed_freedoms
+from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import measured, quantity
+
+
+def freedoms(text: str) -> tuple[str, ...]:
+    """Argument type: 'auto', or freedoms of a pose."""
+    try:
+        return parsed_freedoms(text)
+    except ConfigurationError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def aperture(text: str) -> Aperture:
+    """Argument type: R or R,X,Y [m]."""
+    try:
+        parts = [
+            quantities.LENGTH.checked(float(part), ConfigurationError, name)
+            for part, name in zip(text.split(","), ("radius", "x", "y"), strict=False)
+        ]
+        if len(parts) != len(text.split(",")) or len(parts) == 2 or parts[0] <= 0:
+            raise ValueError
+        return Aperture(*parts)
+    except ConfigurationError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+    except ValueError as err:
+        raise argparse.ArgumentTypeError(
+            f"aperture is {quantities.shown(text)}, expected R or R,X,Y in metres"
+        ) from err
+
+
+def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -> None:
+    """Add the arguments of a registration."""
+    sub.add_argument(
+        "--fit",
+        type=freedoms,
+        default=default,
+        metavar="FREEDOMS",
+        help="'auto', or of piston,tip,tilt,x,y,clocking,power: what is taken out",
+    )
+    sub.add_argument(
+        "--aperture",
+        type=aperture,
+        metavar="R[,X,Y]",
+        help="disc of the part that counts [m]; without it all points do",
+    )
+
+
+_UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
+
+
+def form_rows(facts: Facts) -> list[tuple[str, str]]:
+    """Return what people read of a form."""
+    removed, points = facts["removed"], facts["points"]
+    rows = [
+        (name, _figure(facts["pose"][name], _UNITS.get(name, "rad"))) for name in removed["fitted"]
+    ]
+    rows += [(f"{n} not fitted", why) for n, why in removed["not_determined"].items()]
+    rows += [
+        (name.replace("_", " "), _figure(figure, "m"))
+        for name, figure in facts["deviation"].items()
+    ]
+    others = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read")
+    rows += [("points", f"{points['read']} read: {others}")]
+    rows += [("note", text) for text in removed["notes"]]
+    return rows + [("not evaluated", text) for text in removed["not_evaluated"]]
+
+
+def _figure(figure: dict[str, Any], unit: str) -> str:
+    if figure["uncertainty"] is None:
+        return quantity(figure["value"], unit)
+    return measured(figure["value"], figure["uncertainty"], unit)

@@ -1,0 +1,66 @@
+"""Points of a measurement in portions, with what its systematic errors do to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.core.surface.placement import Portion, Portions
+from omsm_ros.errors import FileError
+from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.fields_file import load_fields
+from omsm_ros.storage.files import CLOUD, SYSTEMATIC
+from omsm_ros.storage.maps.length_units import LengthUnits
+from omsm_ros.storage.maps.read_map import read_points
+
+_PORTION = 131_072
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """portions: reads all points from the start;  sources: of their systematic effects, by name
+
+    systematic: whether the effects of systematic errors are known at all
+    notes: what a reader of the results should know about how the file was understood
+    """
+
+    portions: Portions
+    sources: tuple[str, ...]
+    systematic: bool
+    notes: tuple[str, ...] = ()
+
+
+def open_measurement(path: Path, units: LengthUnits | None = None) -> Measurement:
+    """Open a result folder, a cloud of ours, or a map or cloud of any other format.
+
+    Our own clouds are read in bounded memory, with the fields that lie beside them.
+    units: of a file that does not carry them. Raises FileError for what cannot be read.
+    """
+    file = path / CLOUD if path.is_dir() else path
+    if not file.exists():
+        raise FileError(
+            f"no cloud at {str(file)!r}; give a cloud, a map, or the folder of a measurement"
+        )
+    try:
+        cloud = CloudFile(file)
+    except (FileError, OSError):
+        points = read_points(file, units)
+        whole = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
+        return Measurement(lambda: [whole], (), False, points.notes)
+    beside = file.with_name(SYSTEMATIC)
+    fields = load_fields(beside) if beside.is_file() else None
+    names = fields.names if fields is not None else ()
+    return Measurement(lambda: _portions(cloud, fields), names, fields is not None)
+
+
+def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[Portion]:
+    first = 0
+    for rows in cloud.portions(_PORTION):
+        x, y, height = (rows[name].astype(np.float64) for name in ("x", "y", "height"))
+        effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
+        yield Portion(x, y, height, effects)
+        first += len(x)
