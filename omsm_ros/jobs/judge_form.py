@@ -33,7 +33,12 @@ def judge_form(
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
     form = analyse_form(
-        surface, measured.portions, asked, sources=measured.sources, aperture=aperture
+        surface,
+        measured.portions,
+        asked,
+        sources=measured.sources,
+        aperture=aperture,
+        even=measured.even,
     )
     facts = form_facts(form, measured)
     save_json(out / FORM, facts)

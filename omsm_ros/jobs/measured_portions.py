@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.placement import Portion, Portions
 from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
@@ -26,12 +27,14 @@ class Measurement:
 
     systematic: whether the effects of systematic errors are known at all
     notes: what a reader of the results should know about how the file was understood
+    even: whether the points are those of an evenly spaced grid
     """
 
     portions: Portions
     sources: tuple[str, ...]
     systematic: bool
     notes: tuple[str, ...] = ()
+    even: bool = False
 
 
 def open_measurement(path: Path, units: LengthUnits | None = None) -> Measurement:
@@ -50,7 +53,7 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     except (FileError, OSError):
         points = read_points(file, units)
         whole = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
-        return Measurement(lambda: [whole], (), False, points.notes)
+        return Measurement(lambda: [whole], (), False, points.notes, as_grid(points) is not None)
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
     names = fields.names if fields is not None else ()

@@ -15,6 +15,7 @@ from omsm_ros.core.form.figures import (
     robust_peak_to_valley,
     root_mean_square,
 )
+from omsm_ros.core.form.second_order import without_second_order
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -63,21 +64,23 @@ def analyse_form(
     *,
     sources: Sequence[str] = (),
     aperture: Aperture | None = None,
+    even: bool = False,
 ) -> Form:
     """Register the points and judge what they deviate by.
 
     portions: reads the points, see :class:`omsm_ros.core.surface.placement.Portion`
     asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
     aperture: of the part; None: the disc about the part's origin that holds all points
+    even: the points are those of an evenly spaced grid, each of the same area
 
     Raises DataError for points that are too few, do not fit, or do not determine a freedom.
     """
-    found = register(surface, portions, asked, sources=sources, aperture=aperture)
+    found = register(surface, portions, asked, sources=sources, aperture=aperture, even=even)
     gathered = _Gathered(surface, found, aperture, len(sources))
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
-    map_ = gathered.map(found)
+    map_ = gathered.map(found, even)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
     return Form(
@@ -92,11 +95,14 @@ def analyse_form(
 
 def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> dict[str, Figure]:
     rms, clean = root_mean_square(map_)
+    rest = without_second_order(map_)
     return {
         "peak_to_valley": peak_to_valley(map_, gathered.extent),
         "robust_peak_to_valley": robust_peak_to_valley(map_),
         "rms": rms,
         "rms_without_noise": clean,
+        "peak_to_valley_without_second_order": peak_to_valley(rest, float(np.ptp(rest.deviation))),
+        "rms_without_second_order": root_mean_square(rest)[0],
         "point_noise": Figure(map_.noise, None),
         # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
         "rms_before_fit": Figure(found.before, None),
@@ -164,7 +170,7 @@ class _Gathered:
         """Largest minus smallest deviation of all points [m]."""
         return float(self._most - self._least)
 
-    def map(self, found: Registration) -> DeviationMap:
+    def map(self, found: Registration, even: bool) -> DeviationMap:
         """Return the deviations gathered. Raises DataError if there are none."""
         if not self.counts["used"]:
             raise DataError(f"no point can be used: {self.counts!r}; check aperture and surface")
@@ -173,7 +179,7 @@ class _Gathered:
             x=rows[0],
             y=rows[1],
             deviation=rows[2],
-            area=area_weights(rows[0], rows[1]),
+            area=area_weights(rows[0], rows[1], even=even),
             effects=rows[3:],
             noise=min(float(np.median(self._noise)), found.noise),
         )

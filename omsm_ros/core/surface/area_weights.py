@@ -20,8 +20,13 @@ _MOST_RINGS, _POINTS_PER_RING = 2048, 20
 _MOST_CELLS, _FILLED = 512, 3.5
 
 
-def area_weights(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the area that each point of a scan, in its order, stands for (n,), of mean 1."""
+def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatArray:
+    """Return the area that each point of a scan, in its order, stands for (n,), of mean 1.
+
+    even: the points are of an evenly spaced grid, whole or every k-th; then all stand for one area
+    """
+    if even:
+        return np.ones(len(x))
     group, area = _rings(x, y) if turns(x, y) >= _LEAST_TURNS else _cells(x, y)
     points = np.bincount(group, minlength=len(area))
     weights = (area / np.maximum(points, 1))[group]

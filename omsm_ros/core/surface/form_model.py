@@ -6,7 +6,7 @@ squares would call all of it shift, and state a hundredth of its error. Here the
 
     d = J δ + Z c + noise,   c_k ~ N(0, σ_g²)
 
-J the freedoms of the fit, without bounds, and Z polynomials of radial orders 2 to 8, whose sizes
+J the freedoms of the fit, without bounds, and Z polynomials of orders 2 to 8, whose sizes
 σ_g, one for each order, are found from the data themselves by restricted maximum likelihood
 (D. MacKay, Neural Comput. 4, 415; the fixed point of its eq. 4.9). Form falls with order: no order
 may have less than a higher one, and a size found from few terms may be that of a lucky part: it is
@@ -16,27 +16,82 @@ this part is good, and its uncertainty holds what the others may have.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
 
 HIGHEST_ORDER = 8
-FORM_TERMS: tuple[Term, ...] = terms_up_to(HIGHEST_ORDER, 2)
-_SCALE = np.array([1 / rms_of(term) for term in FORM_TERMS])
+_TERMS: tuple[Term, ...] = terms_up_to(HIGHEST_ORDER)
+_SCALE = np.array([1 / rms_of(term) for term in _TERMS])
+# Of its size: a term of which less is new on these points is left out.
+_LEAST_NEW = 1e-4
 # A turned part has rings of their own size: symmetric terms from the fourth order on are apart.
 _RINGS = HIGHEST_ORDER + 1
-_GROUP = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in FORM_TERMS])
+_ORDERS = np.array([term.n for term in _TERMS])
+_GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
+# Of the products of all terms over the area: one where it is a disc. One whose rim is missing over
+# a hundredth of the radius has two.
+_NEARLY_A_DISC = 10.0
 _TURNS, _SETTLED = 300, 1e-3
 # Beneath a picometre a form error is of no interest, and a variance of zero has no inverse; nor
 # beneath a tenth of the variance that noise leaves of a term, for nothing could tell it.
 _LEAST_M = 1e-12
 _LEAST_SHARE = 0.1
+# Ten times what is left after a plain fit: most of the form may have gone into the pose.
+_MOST_SHARE = 100.0
 # Of the normal distribution at 15 %. With it 95 % bands held the truth in 93 to 100 % of simulated
 # parts with spectra from n⁻² to n⁻⁶, or with single terms; with 20 %, in 90 to 100 %.
 _QUANTILE = 1.0364
+
+
+@dataclass(frozen=True, eq=False)
+class FormBasis:
+    """Polynomials of orders 2 to 8: on a disc Zernike's, on a strip, a ring or a square those that
+    are orthonormal over it, and to piston and tilts, made of Zernike's in their order.
+
+    disc: they are made on;  mix: of all Zernike terms up to order 8 (k, 45);  group: order (k,)
+    """
+
+    disc: Aperture
+    mix: FloatArray
+    group: IntArray
+
+    @classmethod
+    def over(cls, x: FloatArray, y: FloatArray, area: FloatArray, disc: Aperture) -> FormBasis:
+        """Return those of the area that points at x, y [m] stand for, each (n,)."""
+        values = _zernikes(disc, x, y)
+        gram = (values * (area / area.sum())) @ values.T
+        if np.linalg.cond(gram) < _NEARLY_A_DISC:
+            return cls(disc, np.eye(len(_TERMS))[_ORDERS >= 2], _GROUPS[_ORDERS >= 2])
+        rows: list[FloatArray] = []
+        groups: list[int] = []
+        for place in range(len(_TERMS)):
+            row = np.eye(len(_TERMS))[place]
+            for _ in range(2):  # once more takes away what rounding has left
+                for other in rows:
+                    row = row - (other @ gram @ row) * other
+            new = float(row @ gram @ row)
+            if new > _LEAST_NEW**2 * gram[place, place]:
+                rows.append(row / np.sqrt(new))
+                groups.append(int(_GROUPS[place]))
+        form = np.array(groups) >= 2
+        return cls(disc, np.array(rows)[form], np.array(groups)[form])
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the polynomials (k, n) at x, y (n,) [m], each of rms one over the area."""
+        return np.asarray(self.mix @ _zernikes(self.disc, x, y), np.float64)
+
+
+def _zernikes(disc: Aperture, x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.asarray(zernike_values(*disc.scaled(x, y), _TERMS) * _SCALE[:, np.newaxis])
 
 
 class Estimate(NamedTuple):
@@ -50,32 +105,34 @@ class Estimate(NamedTuple):
     sizes: FloatArray
 
 
-def form_columns(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the terms (k, n) at x, y (n,) of the unit disc, each of rms one over it."""
-    return np.asarray(zernike_values(x, y, FORM_TERMS) * _SCALE[:, np.newaxis])
-
-
-def estimate(gram: FloatArray, moments: FloatArray, variance: float, freedoms: int) -> Estimate:
+def estimate(
+    gram: FloatArray, moments: FloatArray, variance: float, largest: float, group: IntArray
+) -> Estimate:
     """Return the estimate from the normal equations of columns [J, Z].
 
     gram: (p + k, p + k);  moments: columns times data (p + k,) [m]
-    variance: of the noise of one point, as it averages out [m²];  freedoms: p
+    variance: of the noise of one point, as it averages out [m²]
+    largest: mean square of the data [m²], which bounds what form there may be
+    group: of each column of Z (k,): its order, or that of rings
     """
+    freedoms = len(gram) - len(group)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
     scale[freedoms:] = 1.0
     noise = max(variance, _LEAST_M**2)
     normal, right = gram / np.outer(scale, scale) / noise, moments / scale / noise
     least = np.maximum(_LEAST_SHARE / np.diag(normal)[freedoms:], _LEAST_M**2)
-    sizes = np.full(len(FORM_TERMS), 1e-14) + least
+    sizes = np.maximum(largest, least)
     for _ in range(_TURNS):
         covariance = _inverse(normal, sizes, freedoms)
         found = covariance @ right
-        new = _sizes(found[freedoms:], np.diag(covariance)[freedoms:], sizes, least)
+        unknown = np.diag(covariance)[freedoms:] / sizes
+        new = _sizes(found[freedoms:], unknown, least, group)
+        new = np.clip(new, least, np.maximum(_MOST_SHARE * largest, least))
         change = float(np.max(np.abs(np.log(new / sizes))))
         sizes = new
         if change < _SETTLED:
             break
-    sizes = sizes * _unlucky(np.diag(covariance)[freedoms:] / sizes)
+    sizes = sizes * _unlucky(np.diag(covariance)[freedoms:] / sizes, group)
     covariance = _inverse(normal, sizes, freedoms)
     found = covariance @ right / scale
     return Estimate(
@@ -95,31 +152,33 @@ def _inverse(normal: FloatArray, sizes: FloatArray, freedoms: int) -> FloatArray
     return np.asarray((inverse + inverse.T) / 2, np.float64)
 
 
-def _unlucky(unknown: FloatArray) -> FloatArray:
+def _unlucky(unknown: FloatArray, group: IntArray) -> FloatArray:
     """Return by how much each variance (k,) may be larger than it was found, in one of seven parts.
 
     unknown: share of each term that the data leave open (k,). The factor is ν/χ²(ν, 15 %), by
     Wilson and Hilferty's approximation, for the ν terms that a group's size was found from.
     """
     factor = np.ones_like(unknown)
-    for group in np.unique(_GROUP):
-        chosen = group == _GROUP
+    for each in np.unique(group):
+        chosen = group == each
         known = max(float(np.sum(1 - unknown[chosen])), 1.0)
         factor[chosen] = (1 - 2 / (9 * known) - _QUANTILE * np.sqrt(2 / (9 * known))) ** -3
     return factor
 
 
-def _sizes(
-    form: FloatArray, spread: FloatArray, sizes: FloatArray, least: FloatArray
-) -> FloatArray:
-    """Return the variance of each term (k,) by its group, none below that of a higher one."""
-    new, above = sizes.copy(), 0.0
-    for group in (_RINGS, *range(HIGHEST_ORDER, 1, -1)):
-        chosen = group == _GROUP
-        known = float(np.sum(1 - spread[chosen] / sizes[chosen]))
-        value = float(np.sum(form[chosen] ** 2)) / max(known, 1e-3)
-        value = max(value, float(least[chosen].max()))
-        if group != _RINGS:
+def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntArray) -> FloatArray:
+    """Return the variance of each term (k,) by its group, none below that of a higher one.
+
+    unknown: share of each term that the data leave open (k,)
+    """
+    new, above = np.empty_like(form), 0.0
+    for each in (_RINGS, *range(HIGHEST_ORDER, 1, -1)):
+        chosen = group == each
+        if not np.any(chosen):
+            continue
+        known = max(float(np.sum(1 - unknown[chosen])), 1e-3)
+        value = max(float(np.sum(form[chosen] ** 2)) / known, float(least[chosen].max()))
+        if each != _RINGS:
             value = above = max(value, above)
         new[chosen] = value
     return new

@@ -16,7 +16,7 @@ GROUP = 128
 class NormalEquations:
     """Of columns with each other, with the deviation and with ``sources`` systematic effects.
 
-    points, square: how many came, and the sum of their squared residuals [m²]
+    points: how many came;  square, total: sums of their squared residuals and deviations [m²]
     gram: (columns, columns + 1 + sources)
     scores: of each column, the sum over groups of 128 successive points of the squared sum of its
         products with the residual: what tells errors that hang together
@@ -26,6 +26,7 @@ class NormalEquations:
     sources: int
     points: int = 0
     square: float = 0.0
+    total: float = 0.0
     gram: FloatArray = field(init=False)
     scores: FloatArray = field(init=False)
 
@@ -40,6 +41,7 @@ class NormalEquations:
         self.gram += columns @ right.T
         self.points += len(deviation)
         self.square += float(residual @ residual)
+        self.total += float(deviation @ deviation)
         edges = np.arange(0, len(residual), GROUP)
         if len(edges):
             self.scores += np.sum(np.add.reduceat(columns * residual, edges, axis=1) ** 2, axis=1)

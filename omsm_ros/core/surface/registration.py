@@ -16,7 +16,8 @@ import numpy as np
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
-from omsm_ros.core.surface.form_model import FORM_TERMS, Estimate, estimate, form_columns
+from omsm_ros.core.surface.area_weights import area_weights
+from omsm_ros.core.surface.form_model import Estimate, FormBasis, estimate
 from omsm_ros.core.surface.freedoms import Freedoms, determined, widest
 from omsm_ros.core.surface.normal_equations import NormalEquations
 from omsm_ros.core.surface.placement import (
@@ -54,7 +55,7 @@ class Registration:
     pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
     moved: by how much each systematic source, off by its uncertainty, moves the freedoms (p, s)
     limit: deviation from the smooth form beyond which a point is an outlier [m]
-    disc: the aperture, or what holds all points;  form: the smooth form on it (k,) [m rms]
+    disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
     """
 
@@ -66,6 +67,7 @@ class Registration:
     moved: FloatArray
     limit: float
     disc: Aperture
+    basis: FormBasis
     form: FloatArray
     noise: float
     before: float
@@ -84,7 +86,7 @@ class Registration:
 
     def good(self, points: Placed) -> BoolArray:
         """Return which points (n,) are no outliers."""
-        smooth = self.form @ form_columns(*self.disc.scaled(points.x, points.y))
+        smooth = self.form @ self.basis.columns(points.x, points.y)
         return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
 
 
@@ -95,11 +97,13 @@ def register(
     *,
     sources: Sequence[str] = (),
     aperture: Aperture | None = None,
+    even: bool = False,
 ) -> Registration:
     """Fit the freedoms ``asked`` for, or "auto", of a part whose nominal is ``surface``.
 
     portions: reads the points, whose ``systematic`` rows are named by ``sources``
     aperture: of the part, beyond which points do not count; None for all of them
+    even: the points are those of an evenly spaced grid
 
     Raises DataError for too few points, a freedom that the surface does not determine, or a fit
     that does not converge.
@@ -115,8 +119,10 @@ def register(
     columns = freedom_columns(start, first, FREEDOMS)
     freedoms = determined(asked, columns @ columns.T, len(first.x))
     at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
-    disc = aperture or _about_the_origin(_usable(placed(surface, at, chosen), aperture))
-    fit = _Fit(surface, freedoms, aperture, disc)
+    points = _usable(placed(surface, at, chosen), aperture)
+    disc = aperture or _about_the_origin(points)
+    basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
+    fit = _Fit(surface, freedoms, aperture, basis)
     at, found, limit = fit.refine(at, chosen)
     unknown = fit.unknown(at, chosen)
     return _over_all(fit, at, found, limit, portions, sources, unknown)
@@ -195,14 +201,14 @@ class _Fit:
     surface: Surface
     freedoms: Freedoms
     aperture: Aperture | None
-    disc: Aperture
+    basis: FormBasis
 
     @property
     def names(self) -> tuple[str, ...]:
         return self.freedoms.fitted
 
     def new_sums(self, sources: int) -> NormalEquations:
-        return NormalEquations(len(self.names) + len(FORM_TERMS), sources)
+        return NormalEquations(len(self.names) + len(self.basis), sources)
 
     def unknown(self, at: Placement, chosen: Portion) -> dict[str, FloatArray]:
         """Return what each freedom that the surface does not determine does to the others (2, p).
@@ -240,7 +246,7 @@ class _Fit:
                 good &= self.aperture.holds(whole.x, whole.y)
             points = whole.part(good)
             systematic = part.systematic[:, good] * points.normal[2]
-            z = form_columns(*self.disc.scaled(points.x, points.y))
+            z = self.basis.columns(points.x, points.y)
             residual = points.deviation - form @ z
             residuals.append(residual)
             near = np.abs(residual) <= limit
@@ -256,12 +262,13 @@ class _Fit:
         # Errors that hang together average out more slowly: so much more of them is left.
         together = float(np.mean(sums.scores[free:] / own)) / variance if variance > 0 else 1.0
         square = sums.gram[:, : sums.columns]
-        found = estimate(square, sums.gram[:, sums.columns], variance * max(together, 1.0), free)
+        moments, largest = sums.gram[:, sums.columns], sums.total / max(sums.points, 1)
+        found = estimate(square, moments, variance * max(together, 1.0), largest, self.basis.group)
         return found, variance
 
     def refine(self, at: Placement, chosen: Portion) -> tuple[Placement, FloatArray, float]:
         """Return the placement that stands, the smooth form there, and the outliers' limit."""
-        form, limit = np.zeros(len(FORM_TERMS)), np.inf
+        form, limit = np.zeros(len(self.basis)), np.inf
         for turn in range(_MOST_TURNS):
             sums = self.new_sums(0)
             residual = self.sums(at, chosen, form, limit, sums)
@@ -314,7 +321,8 @@ def _over_all(
         pose_effects=_root(covariance),
         moved=moved,
         limit=limit,
-        disc=fit.disc,
+        disc=fit.basis.disc,
+        basis=fit.basis,
         form=found.form,
         noise=float(np.sqrt(variance)),
         before=float(np.sqrt(square / max(points, 1.0))),

@@ -1,0 +1,29 @@
+import numpy as np
+
+from omsm_ros.core.form.figures import DeviationMap
+from omsm_ros.core.form.second_order import without_second_order
+
+
+def test_the_second_order_goes_and_nothing_else():
+    """Against weighted least squares of the whole matrix; an effect goes the same way."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-0.25, 0.25, 4000), rng.uniform(0.01, 0.04, 4000)
+    area = rng.uniform(0.1, 2, 4000)
+    rest = 1e-8 * np.sin(60 * x) * np.cos(300 * y)
+    bent = 1e-6 * (1 + x - 3 * y + 4 * x * x - x * y + 9 * y * y)
+    map_ = DeviationMap(x=x, y=y, deviation=rest + bent, area=area,
+                        effects=np.stack([bent, rest]), noise=1e-9)  # fmt: skip
+    found = without_second_order(map_)
+    design = np.stack([x**i * y**j for i in range(3) for j in range(3 - i)], axis=1)
+    root = np.sqrt(area)
+    fitted = np.linalg.lstsq(design * root[:, np.newaxis], rest * root, rcond=None)[0]
+    np.testing.assert_allclose(found.deviation, rest - design @ fitted, atol=1e-16)
+    np.testing.assert_allclose(found.effects[0], 0, atol=1e-16)
+    np.testing.assert_allclose(found.effects[1], found.deviation, atol=1e-16)
+
+
+def test_a_profile_has_a_second_order_too():
+    x = np.linspace(-1e-2, 1e-2, 500)
+    map_ = DeviationMap(x=x, y=0 * x, deviation=1e-9 + 3 * x**2, area=np.ones(500),
+                        effects=np.empty((0, 500)), noise=0.0)  # fmt: skip
+    np.testing.assert_allclose(without_second_order(map_).deviation, 0, atol=1e-15)
