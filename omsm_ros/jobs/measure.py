@@ -79,12 +79,23 @@ def measure(
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
     if report:
-        # Here, because drawing takes longer to load than a scan to correct.
-        from omsm_ros.jobs.publish import figures_of, publish
-
-        figures = figures_of(done.points, calibration, nominal, done.sample_period)
-        publish(out, f"Surface of {bag.name}", summary, calibration, figures)
+        _publish(bag, out, done, summary, calibration, nominal)
     return summary
+
+
+def _publish(
+    bag: Path,
+    out: Path,
+    done: Correction,
+    summary: dict[str, Any],
+    calibration: Calibration,
+    nominal: Surface | None,
+) -> None:
+    # Here, because drawing takes longer to load than a scan to correct.
+    from omsm_ros.jobs.publish import figures_of, publish
+
+    figures = figures_of(done.points, calibration, nominal, done.sample_period)
+    publish(out, f"Surface of {bag.name}", summary, calibration, figures)
 
 
 def _judge_form(
