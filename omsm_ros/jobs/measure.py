@@ -54,8 +54,7 @@ def measure(
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
-    fit: freedoms in which the points are registered to ``nominal``; None: they are not;  aperture:
-        of the part, within which they are
+    fit, aperture: freedoms in which the points are registered to ``nominal``, and within which disc
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
