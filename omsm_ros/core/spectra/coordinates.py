@@ -1,0 +1,125 @@
+"""In what is a line periodic? Over time, path, radius, turns: how far each tells it apart.
+
+A scan at a steady pace cannot: its coordinates are proportional. Where the pace changes, a line
+is sharp in its own coordinate only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.spectra.noise_floor import noise_floor
+from omsm_ros.core.spectra.nonuniform import fourier_sum
+from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+
+# Frequencies looked at in a resolution (one over the range): half-way between two that are one
+# apart a line would lose 60 % of its power.
+OVERSAMPLING = 2
+# A coordinate that departs from proportion by less than this part of a wave is the same.
+_SAME_WAVES = 0.05
+# Of a spectrum over a coordinate that is not even.
+_MOST_FREQUENCIES = 2**21
+# Fewer waves are form or drift, not a line.
+LEAST_WAVES = 5
+# Samples that decide whether a line in one coordinate may be one in another.
+_MOST_COMPARED = 4096
+_SEARCHED_BINS, _STEPS_IN_A_BIN = 12, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinate:
+    """One of them, over a scan.
+
+    values: (n,);  proportional_to_time: so that its spectrum is that over time, rescaled
+    pace: its mean speed [1/s of its unit];  highest: frequency that is looked at
+    """
+
+    name: str
+    values: FloatArray
+    pace: float
+    proportional_to_time: bool
+    highest: float
+
+    @property
+    def resolution(self) -> float:
+        """One over its range."""
+        return 1.0 / float(np.ptp(self.values))
+
+
+def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
+    """Return those in which the scan has moved on, by name."""
+    found = {}
+    for name in (TIME, PATH, RADIUS, TURN):
+        values = signal.coordinate(name)
+        reach = float(np.ptp(values))
+        if name == RADIUS and reach < 1e-3 * float(signal.radius.max()):
+            continue
+        if reach <= 0 or (name == TURN and reach < 0.01):
+            continue
+        found[name] = _coordinate(signal, name, values)
+    return found
+
+
+def _coordinate(signal: ScanSignal, name: str, values: FloatArray) -> Coordinate:
+    # Over the trigger's own pace, so that a gap weighs no more than what is measured.
+    slope, start = np.polyfit(signal.time, values, 1)
+    if name == TIME:
+        return Coordinate(name, values, 1.0, True, signal.rate / 2)
+    typical = float(np.median(abs(np.diff(values)) / np.diff(signal.sample)))
+    highest = 0.5 / max(typical, float(np.ptp(values)) / _MOST_FREQUENCIES)
+    off = float(np.max(abs(values - slope * signal.time - start))) * highest
+    return Coordinate(name, values, abs(float(slope)), off < _SAME_WAVES, highest)
+
+
+def power_over(
+    signal: ScanSignal, values: FloatArray, coordinate: Coordinate
+) -> tuple[FloatArray, float]:
+    """Return squared amplitudes of ``values`` (n,) at steps of a frequency, and that step.
+
+    Over time it is the Fourier sum on the trigger's own grid; missing samples count as zero.
+    """
+    count = len(values)
+    if coordinate.name == TIME:
+        length = OVERSAMPLING * int(signal.sample[-1] + 1)
+        even = np.zeros(length)
+        even[signal.sample] = values
+        spectrum = np.fft.rfft(even)
+        spacing = signal.rate / length
+    else:
+        spacing = coordinate.resolution / OVERSAMPLING
+        size = min(int(coordinate.highest / spacing), OVERSAMPLING * _MOST_FREQUENCIES)
+        spectrum = fourier_sum(coordinate.values, values, spacing, max(size, 16))
+    return abs(spectrum) ** 2 * (2 / count) ** 2, spacing
+
+
+def floor_of(power: FloatArray) -> FloatArray:
+    """Return the mean squared amplitude of noise at each frequency of :func:`power_over`."""
+    return noise_floor(power, OVERSAMPLING)
+
+
+def same_line(
+    one: Coordinate, frequency: float, other: Coordinate
+) -> tuple[float, float]:
+    """Could a line of ``frequency`` in ``one`` be one in ``other``?
+
+    Return the share of its power that a line in ``other`` can take, and the frequency there.
+    """
+    every = max(len(one.values) // _MOST_COMPARED, 1)
+    phase = frequency * one.values[::every]
+    place = other.values[::every] - np.mean(other.values)
+    guess = float(place @ (phase - np.mean(phase)) / (place @ place))
+    reach = _SEARCHED_BINS * _STEPS_IN_A_BIN
+    step = other.resolution / _STEPS_IN_A_BIN
+    tried = guess + step * np.arange(-reach, reach + 1)
+    # From one frequency to the next every sample turns by the same angle.
+    turning = np.exp(2j * np.pi * (phase - tried[0] * place))
+    turn = np.exp(-2j * np.pi * step * place)
+    share = np.empty(len(tried))
+    for k in range(len(tried)):
+        share[k] = abs(np.mean(turning)) ** 2
+        turning = turning * turn
+    best = int(np.argmax(share))
+    return float(share[best]), abs(float(tried[best]))

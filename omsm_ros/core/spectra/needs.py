@@ -1,0 +1,58 @@
+"""The words in which the ripple guard says what it saw, and what would decide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from omsm_ros.core.spectra.hypotheses import PART, SYNCHRONOUS, StudiedScan
+from omsm_ros.core.spectra.lines import Line
+from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
+
+RATE = "an accelerometer, or a scan at another sampling rate, tells"
+_SAME_PACE = 0.02
+
+
+def along(coordinate: str) -> str:
+    """How a wavelength is measured."""
+    return {PATH: "along the path", RADIUS: "from ring to ring"}.get(coordinate, f"over {coordinate}")
+
+
+def images(frequency: float, rate: float) -> str:
+    """The lowest frequencies [Hz] beyond half of ``rate`` [Hz] that are seen at ``frequency``."""
+    return ", ".join(f"{f:.6g} Hz" for f in (rate - frequency, rate + frequency)) + ", …"
+
+
+def nanometres(length: float) -> str:
+    """A length [m] for people."""
+    return f"{length / NANOMETRE_M:.3g} nm"
+
+
+def micrometres(length: float) -> str:
+    """A length [m] for people."""
+    return f"{length / MICROMETRE_M:.4g} µm"
+
+
+def to_decide(scans: Sequence[StudiedScan], own: int, line: Line, kinds: set[str]) -> str:
+    """What would tell the kinds that are left apart."""
+    scan, found = scans[own], []
+    others = [s for k, s in enumerate(scans) if k != own]
+    if not any(_other_pace(scan, s, line) for s in others):
+        found.append("a second scan of the part at another speed or feed")
+    elif PART in kinds or SYNCHRONOUS in kinds:
+        found.append("a further scan at yet another speed")
+    else:
+        found.append("a slower scan that resolves finer texture")
+    if scan.felt is None:
+        found.append("an accelerometer in the bag")
+    return "needs " + " or ".join(found)
+
+
+def _other_pace(scan: StudiedScan, other: StudiedScan, line: Line) -> bool:
+    """True if any coordinate of the line runs at another pace in ``other``."""
+    for name in line.possible:
+        if name != TIME and name in other.coordinates:
+            here, there = scan.coordinates[name].pace, other.coordinates[name].pace
+            if abs(here - there) > _SAME_PACE * here:
+                return True
+    return False

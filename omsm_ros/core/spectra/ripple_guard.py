@@ -1,0 +1,269 @@
+"""What is each line of a scan: on the part, a vibration, folded, the spindle, an artefact?
+
+A kind is named only where some scan tells it from all others: its line is there, where no other
+kind would put it, and is missing in no scan that would have to show it; or where the accelerometer
+feels it; or where the scan's own pace changed, so that it is sharp in one kind only. Else it is
+undecided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omsm_ros.core.dynamics.aliasing import folded_frequency
+from omsm_ros.core.spectra import needs
+from omsm_ros.core.spectra.claims import (
+    Claim,
+    Evidence,
+    Key,
+    Settled,
+    evidence_of,
+    radius_or_turn,
+    settled,
+    size_elsewhere,
+)
+from omsm_ros.core.spectra.felt import Felt, FeltLine
+from omsm_ros.core.spectra.form_removal import Formless, without_form
+from omsm_ros.core.spectra.hypotheses import (
+    ARTEFACT,
+    FOLDED,
+    PART,
+    SYNCHRONOUS,
+    UNDECIDED,
+    VIBRATION,
+    StudiedScan,
+    whole_order,
+)
+from omsm_ros.core.spectra.lines import LEAST_SIGMA, Line, LineSpectrum, find_lines
+from omsm_ros.core.spectra.noise_floor import significance
+from omsm_ros.core.spectra.scan_signal import TIME, TURN, ScanSignal
+
+# What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
+_LEAST_FELT, _MOST_FELT = 0.1, 30.0
+# So many felt lines would agree with a line of the scan by chance that they say nothing.
+_GREATEST_CHANCE = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Named:
+    """A line and what it is.
+
+    kind: one of :data:`omsm_ros.core.spectra.hypotheses.KINDS`;  evidence: what says so
+    needs: what would decide, if undecided
+    frequency: true, of a vibration [Hz], None where it is not known or meant
+    wavelength: of what is on the part [m];  order: waves a turn, of the spindle
+    also: another kind that the same line holds besides
+    """
+
+    line: Line
+    kind: str
+    evidence: tuple[str, ...] = ()
+    needs: str = ""
+    frequency: float | None = None
+    wavelength: float | None = None
+    order: int | None = None
+    also: str = ""
+
+
+def study(signal: ScanSignal, felt: Felt | None = None) -> StudiedScan:
+    """Take form and lines of one scan apart."""
+    formless = without_form(signal)
+    spectrum = find_lines(signal, formless.residual)
+    return StudiedScan(
+        signal=signal,
+        formless=formless,
+        spectrum=spectrum,
+        lines=(*spectrum.lines, *_order_lines(formless, spectrum)),
+        felt=felt,
+    )
+
+
+def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
+    """The significant orders as lines over turns, and over what is proportional to turns."""
+    coordinates = spectrum.coordinates
+    for found in formless.orders:
+        ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
+        sigma = float(significance(ratio, len(formless.orders)))
+        if sigma < LEAST_SIGMA:
+            continue
+        turn = coordinates[TURN]
+        possible = {TURN: float(found.order)}
+        if turn.proportional_to_time:
+            possible |= {
+                name: found.order * turn.pace / c.pace
+                for name, c in coordinates.items()
+                if c.proportional_to_time and name != TURN
+            }
+        yield Line(
+            coordinate=TURN,
+            frequency=float(found.order),
+            cosine=found.cosine,
+            sine=found.sine,
+            frequency_uncertainty=float(np.sqrt(3 / ratio) / np.pi * turn.resolution),
+            amplitude_uncertainty=found.uncertainty,
+            significance=sigma,
+            possible=possible,
+        )
+
+
+def name_lines(scans: Sequence[StudiedScan]) -> list[list[Named]]:
+    """Say of each line of each scan what it is, in the order of the scans and of their lines."""
+    evidence = evidence_of(scans)
+    done = settled(scans, evidence)
+    named = {key: _named(done, key, found) for key, found in evidence.items()}
+    named = {key: _with_true_frequency(scans, named, key) for key in named}
+    return [[named[own, k] for k in range(len(scan.lines))] for own, scan in enumerate(scans)]
+
+
+def _named(done: Settled, key: Key, evidence: Evidence) -> Named:
+    scan, line = done.scans[key[0]], evidence.line
+    claim = done.claim.get(key)
+    own = None if claim is None else _by_claim(done, key, claim)
+    also = done.also.get(key)
+    if own is not None and claim is not None and also is not None:
+        second = _by_claim(done, key, also)
+        text = (
+            f"coincides here with a line that is {second.kind}: elsewhere this has "
+            f"{needs.nanometres(size_elsewhere(done, [claim]))}, "
+            f"the other {needs.nanometres(size_elsewhere(done, [also]))}"
+        )
+        own = replace(own, evidence=(*own.evidence, text), also=second.kind)
+    one = _feeling(scan, line)
+    if one is None:
+        return own or _alone(done, key, evidence)
+    felt_as = _by_feeling(scan, line, one)
+    if own is None or claim is None or own.kind == VIBRATION or own.kind == FOLDED:
+        return felt_as
+    size = size_elsewhere(done, [claim])
+    if size > one.displacement and size > 0.5 * line.amplitude:
+        return replace(own, evidence=(*own.evidence, *felt_as.evidence), also=felt_as.kind)
+    text = f"coincides here with {needs.nanometres(size)} {own.kind}"
+    return replace(felt_as, evidence=(*felt_as.evidence, text), also=own.kind)
+
+
+# ------------------------------------------------------------------- by what other scans show
+
+
+def _by_claim(done: Settled, key: Key, claim: Claim) -> Named:
+    scans, line = done.scans, done.evidence[key].line
+    where = ", ".join(scans[own].signal.name for own, _ in claim.partners)
+    h = claim.hypothesis
+    if claim.kind == PART:
+        text = f"the same wavelength {needs.along(h.coordinate)} in {where}"
+        return Named(line=line, kind=PART, evidence=(text,), wavelength=1 / h.frequency)
+    if claim.kind == ARTEFACT:
+        text = (
+            f"{where} resolves a texture of {needs.micrometres(1 / h.frequency)}, shorter than "
+            "twice the sampling distance here; its image is seen at this place"
+        )
+        return Named(line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / h.frequency)
+    if claim.kind == SYNCHRONOUS:
+        texts = [f"{round(h.frequency)} waves a turn in {where} as well, at another speed"]
+        if scans[key[0]].formless.on_circle:
+            texts.append("on one circle a figure of the part of that order looks the same")
+        order = round(h.frequency)
+        return Named(line=line, kind=SYNCHRONOUS, evidence=tuple(texts), order=order)
+    return _shaken(done, key, claim, where)
+
+
+def _shaken(done: Settled, key: Key, claim: Claim, where: str) -> Named:
+    scans, line, h = done.scans, done.evidence[key].line, claim.hypothesis
+    rate = scans[key[0]].signal.rate
+    rates = {round(scans[own].signal.rate, 6) for own, _ in claim.partners} - {round(rate, 6)}
+    if not rates:
+        text = f"the same frequency in {where}, at another speed over the part"
+        return Named(line=line, kind=VIBRATION, evidence=(text, _or_image(line, rate)))
+    sampled = ", ".join(f"{r:g} Hz" for r in sorted(rates))
+    text = f"seen in {where}, sampled at {sampled}, where {h.frequency:.6g} Hz would be seen"
+    kind = FOLDED if h.frequency > rate / 2 else VIBRATION
+    return Named(line=line, kind=kind, evidence=(text,), frequency=h.frequency)
+
+
+def _or_image(line: Line, rate: float) -> str:
+    return f"itself or the image of {needs.images(line.possible[TIME], rate)}: {needs.RATE}"
+
+
+# ------------------------------------------------------------------ by what is felt or alone
+
+
+def _feeling(scan: StudiedScan, line: Line) -> FeltLine | None:
+    """What the accelerometer feels that would be seen at this line, and is of its size."""
+    if scan.felt is None or TIME not in line.possible:
+        return None
+    seen, rate = line.possible[TIME], scan.signal.rate
+    tolerance = 1 / scan.signal.duration
+    if len(scan.felt.lines) * 4 * tolerance / rate > _GREATEST_CHANCE:
+        tolerance /= 4
+    near = [
+        one
+        for one in scan.felt.lines
+        if abs(float(folded_frequency(one.frequency, rate)) - seen)
+        <= tolerance + 4 * one.frequency_uncertainty
+        and _LEAST_FELT <= one.displacement / line.amplitude <= _MOST_FELT
+    ]
+    return min(near, key=lambda one: abs(np.log(one.displacement / line.amplitude)), default=None)
+
+
+def _by_feeling(scan: StudiedScan, line: Line, one: FeltLine) -> Named:
+    rate = scan.signal.rate
+    texts = [
+        f"the accelerometer feels {one.acceleration:.3g} m/s² along {one.axis} at "
+        f"{one.frequency:.6g} Hz ({one.significance:.0f} σ), {needs.nanometres(one.displacement)} "
+        "of motion"
+    ]
+    folds = one.frequency > rate / 2
+    if folds:
+        seen = float(folded_frequency(one.frequency, rate))
+        texts.append(f"sampled at {rate:g} Hz it is seen at {seen:.6g} Hz")
+    kind = FOLDED if folds else VIBRATION
+    return Named(line=line, kind=kind, evidence=tuple(texts), frequency=one.frequency)
+
+
+def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
+    """What one scan says by itself: its pace changed, and the line is sharp in one kind only."""
+    scan, line = done.scans[key[0]], evidence.line
+    kinds = {t.kind for t in evidence.tested if t.alive}
+    if TIME not in line.possible and kinds == {PART}:
+        text = f"sharp {needs.along(line.coordinate)}, spread over time, for the pace changed"
+        return Named(line=line, kind=PART, evidence=(text,), wavelength=1 / line.frequency)
+    if TIME not in line.possible and set(line.possible) <= {TURN} and SYNCHRONOUS in kinds:
+        order = whole_order(scan, line)
+        text = f"{order} waves a turn, spread over time, for the spindle's speed changed"
+        return Named(line=line, kind=SYNCHRONOUS, evidence=(text,), order=order)
+    if set(line.possible) == {TIME} and len(scan.coordinates) > 1:
+        text = "sharp over time, spread over path and turns, for the pace changed"
+        return Named(
+            line=line, kind=VIBRATION, evidence=(text, _or_image(line, scan.signal.rate))
+        )
+    against = tuple(
+        f"not {t.kind}: missing in {', '.join(done.scans[k].signal.name for k in t.absent)}"
+        for t in evidence.tested
+        if not t.alive
+    )
+    asked = needs.to_decide(done.scans, key[0], line, kinds)
+    if radius_or_turn(evidence.tested):
+        asked = "needs a scan with another feed per turn"
+    return Named(line=line, kind=UNDECIDED, evidence=against, needs=asked)
+
+
+def _with_true_frequency(
+    scans: Sequence[StudiedScan], named: dict[Key, Named], key: Key
+) -> Named:
+    """A vibration whose true frequency another scan has decided."""
+    own = named[key]
+    if own.kind != VIBRATION or own.frequency is not None:
+        return own
+    scan = scans[key[0]]
+    seen, rate = own.line.possible[TIME], scan.signal.rate
+    for (other, _), row in named.items():
+        if other == key[0] or row.frequency is None:
+            continue
+        if abs(float(folded_frequency(row.frequency, rate)) - seen) <= 1 / scan.signal.duration:
+            text = f"{scans[other].signal.name} tells its frequency: {row.frequency:.6g} Hz"
+            kind = FOLDED if row.frequency > rate / 2 else VIBRATION
+            told = (own.evidence[0], text)
+            return replace(own, kind=kind, frequency=row.frequency, evidence=told)
+    return own
