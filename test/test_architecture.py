@@ -41,6 +41,7 @@ ROOMS = {
     "surface": FITTING | {"correction"},
     "comparison": FITTING | {"correction", "surface"},
     "form": FITTING | {"correction", "surface"},
+    "spectra": FITTING,
     "verification": FITTING | {"fitting", "departures", "identification", "correction", "surface"},
 }
 
@@ -296,7 +297,7 @@ def test_a_room_that_looks_where_it_must_not_is_told(room, other):
     """The whole graph: the corridor from samples to identification, and who stands beside it."""
     order = ["samples", "dynamics", "machine", "fitting", "departures", "identification"]
     beside = {"sampled": 6, "correction": 3, "surface": 3, "comparison": 3, "form": 3}
-    beside |= {"verification": 6}
+    beside |= {"spectra": 3, "verification": 6}
     allowed = set(order[: order.index(room) if room in order else beside[room]]) | {room}
     on_points = {"correction", "surface"}
     allowed |= {

@@ -36,6 +36,7 @@ WORDS = {
     "omsm_ros.cli.remembering": ("history",),
     "omsm_ros.cli.exporting": ("export",),
     "omsm_ros.cli.comparing": ("difference",),
+    "omsm_ros.cli.rippling": ("spectrum",),
 }
 
 # What stands after "--" is for the command that these run in turn.

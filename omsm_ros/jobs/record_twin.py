@@ -8,11 +8,10 @@ from pathlib import Path
 import yaml
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.storage import bags
+from omsm_ros.jobs.write_recording import write_recording
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.files import save_text
-from omsm_ros.storage.recording.bag_writer import BagWriter
-from omsm_ros.twin.cell import Recording, blocks_of
+from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
@@ -49,10 +48,5 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
 
 def _write(path: Path, recording: Recording) -> int:
     """Write a recording as a bag; return its samples."""
-    samples = 0
-    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
-        for axes, distance in blocks_of(recording):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
-            samples += len(axes)
-    return samples
+    write_recording(path, recording)
+    return len(recording.axes)

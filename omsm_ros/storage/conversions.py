@@ -176,6 +176,12 @@ def distance_message(messages: Messages, block: DistanceBlock, frame: str = "pro
     )
 
 
+def acceleration_message(messages: Messages, block: AccelerationBlock, frame: str = "probe") -> Any:
+    """``omsm_msgs/AccelerationBlock`` of a record."""
+    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in "xyz"}
+    return messages.make("AccelerationBlock", **_block_message(messages, block, frame), **channels)
+
+
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
     """``omsm_msgs/Calibration`` of a record."""
     return messages.make(

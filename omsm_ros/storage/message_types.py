@@ -34,6 +34,7 @@ _OF_ROS = {
 _MESSAGES = (
     "omsm_msgs/msg/AxisBlock",
     "omsm_msgs/msg/DistanceBlock",
+    "omsm_msgs/msg/AccelerationBlock",
     "omsm_msgs/msg/Calibration",
     *_OF_ROS,
 )

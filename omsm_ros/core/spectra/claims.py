@@ -24,8 +24,8 @@ from omsm_ros.core.spectra.hypotheses import (
     place_in,
     told_by,
 )
-from omsm_ros.core.spectra.lines import Line
-from omsm_ros.core.spectra.scan_signal import PATH, RADIUS
+from omsm_ros.core.spectra.line import Line
+from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
 
 # A partner of that size, over the line's own, is explained by it and by nothing besides.
 _EXPLAINED = (0.7, 1.4)
@@ -163,7 +163,7 @@ def _images(
                 continue
             for partner in texture.partners:
                 place = place_in(scans[partner[0]], texture.hypothesis)
-                if place is not None and place.folded:
+                if place is not None and place.folded and place.coordinate == TIME:
                     image = Claim(ARTEFACT, texture.hypothesis, (key,), key)
                     found.setdefault(partner, []).append(image)
     return found

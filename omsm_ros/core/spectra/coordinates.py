@@ -21,7 +21,7 @@ OVERSAMPLING = 2
 # A coordinate that departs from proportion by less than this part of a wave is the same.
 _SAME_WAVES = 0.05
 # Of a spectrum over a coordinate that is not even.
-_MOST_FREQUENCIES = 2**21
+_MOST_FREQUENCIES = 2**19
 # Fewer waves are form or drift, not a line.
 LEAST_WAVES = 5
 # Samples that decide whether a line in one coordinate may be one in another.
@@ -33,14 +33,16 @@ _SEARCHED_BINS, _STEPS_IN_A_BIN = 12, 4
 class Coordinate:
     """One of them, over a scan.
 
-    values: (n,);  proportional_to_time: so that its spectrum is that over time, rescaled
-    pace: its mean speed [1/s of its unit];  highest: frequency that is looked at
+    values: (n,);  pace: its mean speed [1/s of its unit]
+    like: the coordinate to which it is proportional, so that a line in one is one in the other;
+        its own name if there is none before it
+    highest: frequency that is looked at
     """
 
     name: str
     values: FloatArray
     pace: float
-    proportional_to_time: bool
+    like: str
     highest: float
 
     @property
@@ -48,30 +50,42 @@ class Coordinate:
         """One over its range."""
         return 1.0 / float(np.ptp(self.values))
 
+    @property
+    def proportional_to_time(self) -> bool:
+        """True where the pace is steady."""
+        return self.like == TIME
+
 
 def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
     """Return those in which the scan has moved on, by name."""
-    found = {}
-    for name in (TIME, PATH, RADIUS, TURN):
+    found: dict[str, Coordinate] = {}
+    for name in (TIME, PATH, TURN, RADIUS):
         values = signal.coordinate(name)
         reach = float(np.ptp(values))
-        if name == RADIUS and reach < 1e-3 * float(signal.radius.max()):
-            continue
-        if reach <= 0 or (name == TURN and reach < 0.01):
-            continue
-        found[name] = _coordinate(signal, name, values)
+        least = {RADIUS: 1e-3 * float(signal.radius.max()), TURN: 0.01}.get(name, 0.0)
+        if reach > least:
+            found[name] = _coordinate(signal, name, values, found)
     return found
 
 
-def _coordinate(signal: ScanSignal, name: str, values: FloatArray) -> Coordinate:
-    # Over the trigger's own pace, so that a gap weighs no more than what is measured.
-    slope, start = np.polyfit(signal.time, values, 1)
+def _coordinate(
+    signal: ScanSignal, name: str, values: FloatArray, before: dict[str, Coordinate]
+) -> Coordinate:
+    pace = abs(float(np.polyfit(signal.time, values, 1)[0]))
     if name == TIME:
-        return Coordinate(name, values, 1.0, True, signal.rate / 2)
+        return Coordinate(name, values, 1.0, TIME, signal.rate / 2)
     typical = float(np.median(abs(np.diff(values)) / np.diff(signal.sample)))
-    highest = 0.5 / max(typical, float(np.ptp(values)) / _MOST_FREQUENCIES)
-    off = float(np.max(abs(values - slope * signal.time - start))) * highest
-    return Coordinate(name, values, abs(float(slope)), off < _SAME_WAVES, highest)
+    nyquist = 0.5 / max(typical, float(np.ptp(values)) / _MOST_FREQUENCIES)
+    for other in before.values():
+        if other.like == other.name and _proportional(values, other.values) * nyquist < _SAME_WAVES:
+            return Coordinate(name, values, pace, other.name, nyquist)
+    return Coordinate(name, values, pace, name, nyquist)
+
+
+def _proportional(values: FloatArray, other: FloatArray) -> float:
+    """How far ``values`` departs from proportion to ``other``, in its own unit."""
+    slope, start = np.polyfit(other - other[0], values, 1)
+    return float(np.max(abs(values - slope * (other - other[0]) - start)))
 
 
 def power_over(
@@ -92,7 +106,8 @@ def power_over(
         spacing = coordinate.resolution / OVERSAMPLING
         size = min(int(coordinate.highest / spacing), OVERSAMPLING * _MOST_FREQUENCIES)
         spectrum = fourier_sum(coordinate.values, values, spacing, max(size, 16))
-    return abs(spectrum) ** 2 * (2 / count) ** 2, spacing
+    power = abs(spectrum) ** 2 * (2 / count) ** 2
+    return np.asarray(power, np.float64), spacing
 
 
 def floor_of(power: FloatArray) -> FloatArray:
@@ -100,9 +115,7 @@ def floor_of(power: FloatArray) -> FloatArray:
     return noise_floor(power, OVERSAMPLING)
 
 
-def same_line(
-    one: Coordinate, frequency: float, other: Coordinate
-) -> tuple[float, float]:
+def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[float, float]:
     """Could a line of ``frequency`` in ``one`` be one in ``other``?
 
     Return the share of its power that a line in ``other`` can take, and the frequency there.

@@ -53,7 +53,7 @@ def density(values: FloatArray, step: float) -> Density:
     # All frequencies but zero and Nyquist stand for their negative as well.
     power[1 : (count + 1) // 2] *= 2
     spacing = 1.0 / (count * step)
-    return Density(np.arange(len(power)) * spacing, power, spacing)
+    return Density(np.asarray(np.arange(len(power)) * spacing), np.asarray(power), spacing)
 
 
 def evenly(place: FloatArray, values: FloatArray, step: float) -> FloatArray:
@@ -62,7 +62,7 @@ def evenly(place: FloatArray, values: FloatArray, step: float) -> FloatArray:
     For looking at: where samples are further apart than ``step`` the fine part is not measured.
     """
     count = int((place[-1] - place[0]) / step) + 1
-    return np.interp(place[0] + step * np.arange(count), place, values)
+    return np.asarray(np.interp(place[0] + step * np.arange(count), place, values))
 
 
 def smoothed(spectrum: Density, bins: int = 600) -> tuple[FloatArray, FloatArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
     first = np.array([block.first_sample for block in blocks])
     end = first + np.array([len(block) for block in blocks])
     cuts = np.r_[0, np.flatnonzero(first[1:] != end[:-1]) + 1, len(blocks)]
-    lengths = [int(end[b - 1] - first[a]) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    lengths = [int(end[b - 1] - first[a]) for a, b in pairwise(cuts)]
     longest = int(np.argmax(lengths))
     run = blocks[cuts[longest] : cuts[longest + 1]]
     axes = {axis: np.concatenate([getattr(b, axis) for b in run]) for axis in AXES}

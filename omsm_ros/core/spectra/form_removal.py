@@ -7,9 +7,11 @@ can do at its centre. Elsewhere polynomials of time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from math import comb
+from typing import TypeAlias
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -17,17 +19,26 @@ from numpy.polynomial import legendre
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.spectra.scan_signal import ScanSignal
 
+Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
+"""Columns (m, q) of what is to be fitted beside the form, at the samples (m,) asked for."""
+
 # Fewer turns do not tell what repeats with the turn.
 LEAST_TURNS = 1.5
 # Harmonics of a turn that may be the spindle's beside the figure's.
 HIGHEST_ORDER = 12
+# One wave a turn is how the part sits on the chuck.
+LOWEST_ORDER = 2
 _DRIFT_DEGREE = 3
 _DEGREES = range(2, 15, 2)
-# A higher degree has to take away this share of what is left, or it fits noise and lines.
-_WORTH = 0.02
+_USUAL_DEGREE = 6
+# A higher degree has to take away this share of what is left, or it fits noise and lines; less
+# where the lines are known and taken out before.
+_WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
 # Even samples that determine the form; it is smooth, and the rest would only cost time.
 _MOST_FITTED = 100_000
 _CHUNK = 16_384
+# Nearer to a whole number of waves a turn, in resolutions, it is one.
+_OWNED = 0.6
 # Radii within this part of the largest are one circle.
 _CIRCLE = 0.02
 # Directions that the scan determines worse than this, of its best, stay at zero.
@@ -68,31 +79,76 @@ class Formless:
     on_circle: bool
 
 
+class FormFit:
+    """Form and orders of one scan, fitted once or again after its lines have become known."""
+
+    def __init__(self, signal: ScanSignal) -> None:
+        self._signal = signal
+        self._height = signal.height - np.mean(signal.height)
+        every = max(len(signal) // _MOST_FITTED, 1)
+        self._chosen = np.arange(0, len(signal), every)
+        self._degree = self._enough(self._height, _WORTH)
+
+    @property
+    def _basis(self) -> _Basis:
+        return _Basis.of(self._signal).up_to(self._degree)
+
+    def _enough(self, values: FloatArray, worth: float) -> int:
+        """The degree beyond which nothing worth it is taken away; few parts need a high one."""
+        for top in (_USUAL_DEGREE, max(_DEGREES)):
+            basis = _Basis.of(self._signal).up_to(top)
+            gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
+            energy = float(np.sum(values[self._chosen] ** 2))
+            degree = _enough(basis, gram, moment, energy, worth)
+            if degree < top:
+                break
+        return degree
+
+    def refine(self, heights: FloatArray) -> None:
+        """Choose the degree again, once the ``heights`` of all lines (n,) [m] are known."""
+        bare = self._height - heights
+        self._degree = max(self._degree, self._enough(bare, _WORTH_WITHOUT_LINES))
+
+    def without(self, waves: Waves | None = None) -> Formless:
+        """Take form, drift and orders out, as they are beside ``waves``, which stay in."""
+        basis, signal, chosen = self._basis, self._signal, self._chosen
+        own = len(basis.names)
+        gram, moment = _normal_equations(basis, signal, self._height, chosen, waves)
+        inverse = _inverse(gram)
+        solution = np.zeros(len(gram))
+        residual = self._height
+        for _ in range(2):  # the second takes out what rounding left of millimetres
+            solution += inverse @ moment
+            residual = self._height - _evaluated(basis, signal, solution[:own])
+            bare = (
+                residual if waves is None else residual - _waves_of(waves, signal, solution[own:])
+            )
+            _, moment = _normal_equations(basis, signal, bare, chosen, waves)
+        variance = float(np.mean(bare[chosen] ** 2))
+        spread = np.sqrt(np.maximum(np.diag(inverse)[:own], 0.0) * variance)
+        return Formless(
+            residual=residual,
+            degree=self._degree,
+            removed=float(np.std(self._height - residual)),
+            orders=tuple(_orders(basis, solution, spread)),
+            on_circle=basis.on_circle,
+        )
+
+    def owned(self) -> list[tuple[float, float]]:
+        """Waves a turn that belong to form and orders, and how many resolutions about each.
+
+        A harmonic with q radial functions reaches q/2 resolutions to either side.
+        """
+        if self._signal.turns < LEAST_TURNS:
+            return []
+        radial = Counter(abs(m) for kind, _, m in self._basis.names if kind == "form" and m >= 0)
+        highest = max([HIGHEST_ORDER, *radial])
+        return [(float(k), _OWNED + 0.5 * radial[k]) for k in range(1, highest + 1)]
+
+
 def without_form(signal: ScanSignal) -> Formless:
     """Take form, drift and what repeats with the spindle out of the heights of ``signal``."""
-    basis = _Basis.of(signal)
-    every = max(len(signal) // _MOST_FITTED, 1)
-    chosen = np.arange(0, len(signal), every)
-    height = signal.height - np.mean(signal.height)
-    gram, moment = _normal_equations(basis, signal, height, chosen)
-    degree, columns = _enough(basis, gram, moment, float(np.sum(height[chosen] ** 2)))
-    solution = np.zeros(len(basis.names))
-    residual = height
-    for _ in range(2):  # the second takes out what rounding left of millimetres
-        solution[columns] += _solved(gram, moment, columns)
-        residual = height - _evaluated(basis, signal, solution)
-        _, moment = _normal_equations(basis, signal, residual, chosen)
-    variance = float(np.mean(residual[chosen] ** 2))
-    spread = np.zeros(len(basis.names))
-    inverse = _inverse(gram[np.ix_(columns, columns)])
-    spread[columns] = np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance)
-    return Formless(
-        residual=residual,
-        degree=degree,
-        removed=float(np.std(height - residual)),
-        orders=tuple(_orders(basis, solution, spread)),
-        on_circle=basis.on_circle,
-    )
+    return FormFit(signal).without()
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +178,11 @@ class _Basis:
             names += [("form", 1, 1), ("form", 1, -1)]
         return cls(tuple(names), on_circle, largest)
 
+    def up_to(self, degree: int) -> _Basis:
+        """Only the columns that a fit of ``degree`` has."""
+        kept = tuple(name for name in self.names if self.degree(name) <= degree)
+        return replace(self, names=kept)
+
     def degree(self, name: tuple[str, int, int]) -> int:
         """From which degree on a column belongs to the fit; of a scan along no turn, of time."""
         kind, n, _ = name
@@ -136,7 +197,8 @@ class _Basis:
         """Values of all columns at the samples ``chosen`` (m,): (m, p)."""
         time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
         rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
-        turns = {k: np.exp(1j * k * angle) for k in range(max(max(_DEGREES), HIGHEST_ORDER) + 1)}
+        highest = max((abs(m) for _, _, m in self.names), default=0)
+        turns = {k: np.exp(1j * k * angle) for k in range(highest + 1)}
         found = np.empty((len(chosen), len(self.names)))
         for place, (kind, n, m) in enumerate(self.names):
             wave = turns[abs(m)].real if m >= 0 else turns[-m].imag
@@ -159,31 +221,46 @@ def _radial(degree: int, harmonic: int, rho: FloatArray) -> FloatArray:
 
 
 def _normal_equations(
-    basis: _Basis, signal: ScanSignal, values: FloatArray, chosen: np.ndarray
+    basis: _Basis,
+    signal: ScanSignal,
+    values: FloatArray,
+    chosen: np.ndarray,
+    waves: Waves | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    size = len(basis.names)
-    gram, moment = np.zeros((size, size)), np.zeros(size)
+    gram, moment = np.zeros((0, 0)), np.zeros(0)
     for first in range(0, len(chosen), _CHUNK):
         part = chosen[first : first + _CHUNK]
         columns = basis.columns(signal, part)
+        if waves is not None:
+            columns = np.hstack([columns, waves(part)])
+        if not len(gram):
+            gram, moment = np.zeros((columns.shape[1],) * 2), np.zeros(columns.shape[1])
         gram += columns.T @ columns
         moment += columns.T @ values[part]
     return gram, moment
 
 
+def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatArray:
+    parts = [
+        waves(np.arange(first, min(first + _CHUNK, len(signal)))) @ solution
+        for first in range(0, len(signal), _CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
 def _enough(
-    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float
-) -> tuple[int, np.ndarray]:
-    """The degree beyond which nothing worth it is taken away, and its columns."""
+    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
+) -> int:
+    """The degree beyond which nothing worth it is taken away."""
     needed = np.array([basis.degree(name) for name in basis.names])
-    left, kept = energy, (0, np.flatnonzero(needed == 0))
-    for degree in _DEGREES:
+    left, kept = energy, 0
+    for degree in (d for d in _DEGREES if d <= needed.max()):
         columns = np.flatnonzero(needed <= degree)
         solution = _solved(gram, moment, columns)
         now = energy - float(solution @ moment[columns])
-        if degree > _DEGREES[0] and now > (1 - _WORTH) * left:
+        if degree > _DEGREES[0] and now > (1 - worth) * left:
             break
-        left, kept = now, (degree, columns)
+        left, kept = now, degree
     return kept
 
 
@@ -209,7 +286,7 @@ def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> Float
 
 def _orders(basis: _Basis, solution: FloatArray, spread: FloatArray) -> Iterator[Order]:
     found = {name: place for place, name in enumerate(basis.names) if name[0] == "order"}
-    for k in range(2, HIGHEST_ORDER + 1):
+    for k in range(LOWEST_ORDER, HIGHEST_ORDER + 1):
         if ("order", k, k) in found:
             cosine, sine = found["order", k, k], found["order", k, -k]
             worse = float(max(spread[cosine], spread[sine]))

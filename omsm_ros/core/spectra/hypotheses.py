@@ -15,7 +15,8 @@ from omsm_ros.core.dynamics.aliasing import folded_frequency
 from omsm_ros.core.spectra.coordinates import LEAST_WAVES, Coordinate
 from omsm_ros.core.spectra.felt import Felt
 from omsm_ros.core.spectra.form_removal import HIGHEST_ORDER, Formless
-from omsm_ros.core.spectra.lines import Line, LineSpectrum
+from omsm_ros.core.spectra.line import Line
+from omsm_ros.core.spectra.lines import LineSpectrum
 from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 
 PART, VIBRATION, SYNCHRONOUS = "on the part", "vibration", "synchronous spindle error"
@@ -142,10 +143,9 @@ def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
     if coordinate is None:
         return None
     if not coordinate.proportional_to_time:
-        if hypothesis.frequency > coordinate.highest:
-            return None
+        fine = hypothesis.frequency > coordinate.highest
         tolerance = hypothesis.uncertainty + _OWN_BIN * coordinate.resolution
-        return Place(coordinate.name, hypothesis.frequency, tolerance, False)
+        return Place(coordinate.name, hypothesis.frequency, tolerance, fine)
     in_time = hypothesis.frequency * coordinate.pace
     rate = scan.signal.rate
     seen = float(folded_frequency(in_time, rate))
@@ -187,15 +187,15 @@ def told_by(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool
     line = found_at(scan, place)
     if line is not None:
         ratio = line.amplitude / amplitude
-        least = 1 / _AMPLITUDES * (1.0 if hypothesis.kind != PART else _least_share(scan, hypothesis))
+        least = (
+            1 / _AMPLITUDES * (1.0 if hypothesis.kind != PART else _least_share(scan, hypothesis))
+        )
         alike = hypothesis.kind == VIBRATION or least <= ratio <= _AMPLITUDES
         return True if alike else None
     return None if _may_hide(scan, hypothesis, place, amplitude) else False
 
 
-def _may_hide(
-    scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude: float
-) -> bool:
+def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude: float) -> bool:
     """True if the line could be there and not be found."""
     if hypothesis.kind == VIBRATION:
         return False  # the machine may stand still: absence is no proof, and is never used as one
@@ -203,6 +203,8 @@ def _may_hide(
         if place.frequency < (LEAST_WAVES + 1) * scan.resolution(TIME) or _near_form(scan, place):
             return True
         floor = scan.spectrum.sigma_at(place.frequency)
+    elif place.folded:
+        return True  # it is looked for only where another scan has found it
     else:
         floor = scan.spectrum.noise * np.sqrt(2 / len(scan.signal))
     return amplitude * _least_share(scan, hypothesis) < _WOULD_BE_SEEN * floor

@@ -7,8 +7,8 @@ window's main lobe come apart, and a strong one hides no weak one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,47 +22,25 @@ from omsm_ros.core.spectra.coordinates import (
     power_over,
     same_line,
 )
+from omsm_ros.core.spectra.line import (
+    CLOSEST,
+    Line,
+    fitted,
+    in_their_coordinates,
+    start,
+    sum_of,
+)
 from omsm_ros.core.spectra.noise_floor import ratio_at, significance
-from omsm_ros.core.spectra.scan_signal import TIME, ScanSignal
+from omsm_ros.core.spectra.scan_signal import TIME, TURN, ScanSignal
 
 LEAST_SIGMA = 3.0
 MOST_LINES = 40
 # Of the strongest that is left: weaker ones may be its side lobes.
 _TAKEN_TOGETHER = 0.3
 _APART_BINS = 8
-# Closer than this to another, in resolutions, a line is its own side lobe; two true ones cannot
-# be fitted.
-_CLOSEST = 0.6
-_FITTING_STEPS = 4
-_CHUNK = 32_768
 # A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
 # and more of its power than jitter and encoders do.
 _LOST_RATIO, _LOST_SHARE = 12.5, 0.05
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
-    """``cosine · cos(2π f u) + sine · sin(2π f u)``, u one coordinate of the scan.
-
-    coordinate: in which it is sharpest;  frequency: there [1/unit], its standard uncertainty
-    amplitude_uncertainty: of cosine and sine alike, from the noise floor beside the line [m]
-    significance: σ, see :func:`noise_floor.significance`
-    possible: every coordinate in which it may be a line, and the frequency there
-    """
-
-    coordinate: str
-    frequency: float
-    cosine: float
-    sine: float
-    frequency_uncertainty: float = 0.0
-    amplitude_uncertainty: float = 0.0
-    significance: float = 0.0
-    possible: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def amplitude(self) -> float:
-        """Half of peak to valley [m]."""
-        return float(np.hypot(self.cosine, self.sine))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,19 +63,35 @@ class LineSpectrum:
         return float(np.interp(frequency, self.floor_frequency, self.amplitude_floor))
 
 
-def find_lines(signal: ScanSignal, values: FloatArray) -> LineSpectrum:
-    """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ."""
+def find_lines(
+    signal: ScanSignal,
+    values: FloatArray,
+    known: Sequence[Line] = (),
+    owned: Sequence[tuple[float, float]] = (),
+) -> LineSpectrum:
+    """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
+
+    known: lines found before, to start with
+    owned: waves a turn that are no lines of their own, and how many resolutions about each
+    """
     coordinates = coordinates_of(signal)
-    searched = [c for c in coordinates.values() if c.name == TIME or not c.proportional_to_time]
-    lines: list[Line] = []
-    residual = values
+    searched = [c for c in coordinates.values() if c.like == c.name]
+    reserved = _reserved(coordinates, owned)
+    lines = _free(fitted(list(known), coordinates, values), coordinates, reserved) if known else []
+    residual = values - sum_of(lines, coordinates, len(values))
+    taken = {name: list(places) for name, places in reserved.items()}
     while len(lines) < MOST_LINES:
-        new = _strongest(signal, residual, searched, lines)
+        new = _strongest(signal, residual, searched, lines, taken)
         if not new:
             break
         before = float(residual @ residual)
-        lines = _fitted(lines + new, coordinates, values)
-        residual = values - _sum_of(lines, coordinates, len(values))
+        for line in new:  # what moved away in the fit is not found again
+            taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
+        lines = fitted(lines + new, coordinates, values)
+        residual = values - sum_of(lines, coordinates, len(values))
+        lines = in_their_coordinates(lines, new, coordinates, residual)
+        lines = _free(lines, coordinates, reserved)
+        residual = values - sum_of(lines, coordinates, len(values))
         if float(residual @ residual) > before * (1 - 1e-6):
             break
     return _judged(signal, lines, coordinates, residual)
@@ -108,6 +102,7 @@ def _strongest(
     residual: FloatArray,
     searched: Sequence[Coordinate],
     known: Sequence[Line],
+    taken: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[Line]:
     """The strongest lines left, all of one coordinate."""
     best: tuple[float, list[Line]] = (0.0, [])
@@ -117,16 +112,43 @@ def _strongest(
         ratio = power / floor_of(power)
         least = np.arange(len(power)) * spacing < LEAST_WAVES * coordinate.resolution
         ratio[least] = 0.0
-        for line in known:
-            if line.coordinate == coordinate.name:
-                ratio[abs(np.arange(len(power)) - line.frequency / spacing) < OVERSAMPLING * _CLOSEST] = 0.0
+        lines = [(k.frequency, CLOSEST) for k in known if k.coordinate == coordinate.name]
+        for frequency, bins in (*lines, *taken.get(coordinate.name, ())):
+            place, half = frequency / spacing, bins * OVERSAMPLING
+            ratio[max(int(np.ceil(place - half)), 0) : max(int(place + half) + 1, 0)] = 0.0
         peaks = _peaks(ratio, ratio_at(LEAST_SIGMA, tried))
         if len(peaks) and power[peaks[0]] > best[0]:
             # An amplitude only to start with; the fit gives phase and frequency.
-            taken = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
-            lines = [_start(coordinate, k * spacing, residual) for k in _spaced(taken)]
-            best = float(power[peaks[0]]), lines[: MOST_LINES - len(known)]
+            strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
+            new = [start(coordinate, k * spacing, residual) for k in _spaced(strong)]
+            best = float(power[peaks[0]]), new[: MOST_LINES - len(known)]
     return best[1]
+
+
+def _reserved(
+    coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
+) -> dict[str, list[tuple[float, float]]]:
+    """Frequencies of ``owned`` waves a turn, over turns and over time."""
+    turn = coordinates.get(TURN)
+    if turn is None:
+        return {}
+    return {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
+
+
+def _free(
+    lines: list[Line],
+    coordinates: dict[str, Coordinate],
+    reserved: Mapping[str, Sequence[tuple[float, float]]],
+) -> list[Line]:
+    """Without those that have moved to where form and orders are."""
+    return [
+        line
+        for line in lines
+        if all(
+            abs(line.frequency - frequency) > bins * coordinates[line.coordinate].resolution
+            for frequency, bins in reserved.get(line.coordinate, ())
+        )
+    ]
 
 
 def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
@@ -147,93 +169,6 @@ def _spaced(places: np.ndarray) -> list[int]:
     return kept
 
 
-def _start(coordinate: Coordinate, frequency: float, values: FloatArray) -> Line:
-    phase = np.exp(-2j * np.pi * frequency * coordinate.values)
-    mean = 2 * complex(values @ phase) / len(values)
-    return Line(coordinate=coordinate.name, frequency=frequency, cosine=mean.real, sine=-mean.imag)
-
-
-def _fitted(
-    lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray
-) -> list[Line]:
-    """All lines at once: amplitudes first, then frequencies as well."""
-    lines = _stepped(lines, coordinates, values, turning=False)
-    for _ in range(_FITTING_STEPS):
-        lines = _apart(_stepped(lines, coordinates, values, turning=True), coordinates)
-    return _stepped(lines, coordinates, values, turning=False)
-
-
-def _apart(lines: list[Line], coordinates: dict[str, Coordinate]) -> list[Line]:
-    """Without the weaker of two that are one."""
-    kept: list[Line] = []
-    for line in sorted(lines, key=lambda one: -one.amplitude):
-        bin_ = coordinates[line.coordinate].resolution
-        if all(
-            k.coordinate != line.coordinate or abs(k.frequency - line.frequency) > _CLOSEST * bin_
-            for k in kept
-        ):
-            kept.append(line)
-    return kept
-
-
-def _columns(line: Line, place: FloatArray, middle: float, turning: bool) -> list[FloatArray]:
-    phase = 2 * np.pi * line.frequency * place
-    cosine, sine = np.cos(phase), np.sin(phase)
-    if not turning:
-        return [cosine, sine]
-    across = line.sine * cosine - line.cosine * sine
-    return [cosine, sine, 2 * np.pi * (place - middle) * across]
-
-
-def _stepped(
-    lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray, *, turning: bool
-) -> list[Line]:
-    """One Gauss-Newton step of cosines, sines and, if ``turning``, frequencies."""
-    per = 3 if turning else 2
-    gram, moment = np.zeros((per * len(lines),) * 2), np.zeros(per * len(lines))
-    for first in range(0, len(values), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        columns: list[FloatArray] = []
-        model = np.zeros(len(values[part]))
-        for line in lines:
-            own = coordinates[line.coordinate].values
-            made = _columns(line, own[part], float(own[0] + own[-1]) / 2, turning)
-            model += line.cosine * made[0] + line.sine * made[1]
-            columns += made
-        matrix = np.array(columns)
-        gram += matrix @ matrix.T
-        moment += matrix @ (values[part] - model)
-    scale = 1 / np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-    step = scale * np.linalg.lstsq(gram * np.outer(scale, scale), scale * moment, rcond=1e-9)[0]
-    return [
-        _moved(line, step[per * k : per * (k + 1)], coordinates[line.coordinate])
-        for k, line in enumerate(lines)
-    ]
-
-
-def _moved(line: Line, step: FloatArray, coordinate: Coordinate) -> Line:
-    """A frequency moves by half a resolution at most, for further away it is another line.
-
-    The derivative is taken about the middle of the scan, the phase told at its zero.
-    """
-    cosine, sine = line.cosine + step[0], line.sine + step[1]
-    if len(step) < 3:
-        return replace(line, cosine=cosine, sine=sine)
-    shift = float(np.clip(step[2], -0.5 * coordinate.resolution, 0.5 * coordinate.resolution))
-    middle = float(coordinate.values[0] + coordinate.values[-1]) / 2
-    turned = (cosine - 1j * sine) * np.exp(-2j * np.pi * shift * middle)
-    frequency = abs(line.frequency + shift)
-    return replace(line, frequency=frequency, cosine=turned.real, sine=-turned.imag)
-
-
-def _sum_of(lines: Sequence[Line], coordinates: dict[str, Coordinate], count: int) -> FloatArray:
-    total = np.zeros(count)
-    for line in lines:
-        phase = 2 * np.pi * line.frequency * coordinates[line.coordinate].values
-        total += line.cosine * np.cos(phase) + line.sine * np.sin(phase)
-    return total
-
-
 def _judged(
     signal: ScanSignal,
     lines: list[Line],
@@ -244,7 +179,8 @@ def _judged(
     floors = {}
     for name in {TIME, *(line.coordinate for line in lines)}:
         power, spacing = power_over(signal, residual, coordinates[name])
-        floors[name] = np.arange(len(power)) * spacing, floor_of(power)
+        grid = np.asarray(np.arange(len(power)) * spacing, np.float64)
+        floors[name] = grid, floor_of(power)
     found = []
     for line in lines:
         frequency, floor = floors[line.coordinate]
@@ -282,7 +218,7 @@ def _possible(line: Line, ratio: float, coordinates: dict[str, Coordinate]) -> d
     for name, other in coordinates.items():
         if name == line.coordinate:
             continue
-        if own.proportional_to_time and other.proportional_to_time:
+        if own.like == other.like:
             found[name] = line.frequency * own.pace / other.pace
             continue
         share, frequency = same_line(own, line.frequency, other)

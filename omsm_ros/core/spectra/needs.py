@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from omsm_ros.core.spectra.hypotheses import PART, SYNCHRONOUS, StudiedScan
-from omsm_ros.core.spectra.lines import Line
+from omsm_ros.core.spectra.line import Line
 from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
@@ -15,7 +15,9 @@ _SAME_PACE = 0.02
 
 def along(coordinate: str) -> str:
     """How a wavelength is measured."""
-    return {PATH: "along the path", RADIUS: "from ring to ring"}.get(coordinate, f"over {coordinate}")
+    return {PATH: "along the path", RADIUS: "from ring to ring"}.get(
+        coordinate, f"over {coordinate}"
+    )
 
 
 def images(frequency: float, rate: float) -> str:

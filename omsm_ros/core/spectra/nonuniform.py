@@ -8,8 +8,8 @@ SIAM Review 46, 2004; kernel of Fessler and Sutton, IEEE Trans. Signal Process. 
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
 from numpy.typing import NDArray
+from scipy import special
 
 from omsm_ros.core.samples.blocks import FloatArray
 

@@ -26,7 +26,7 @@ from omsm_ros.core.spectra.claims import (
     size_elsewhere,
 )
 from omsm_ros.core.spectra.felt import Felt, FeltLine
-from omsm_ros.core.spectra.form_removal import Formless, without_form
+from omsm_ros.core.spectra.form_removal import FormFit, Formless
 from omsm_ros.core.spectra.hypotheses import (
     ARTEFACT,
     FOLDED,
@@ -37,12 +37,15 @@ from omsm_ros.core.spectra.hypotheses import (
     StudiedScan,
     whole_order,
 )
-from omsm_ros.core.spectra.lines import LEAST_SIGMA, Line, LineSpectrum, find_lines
+from omsm_ros.core.spectra.line import Line, sum_of, texture, waves_of
+from omsm_ros.core.spectra.lines import LEAST_SIGMA, LineSpectrum, find_lines
 from omsm_ros.core.spectra.noise_floor import significance
-from omsm_ros.core.spectra.scan_signal import TIME, TURN, ScanSignal
+from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 
 # What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
 _LEAST_FELT, _MOST_FELT = 0.1, 30.0
+# The first makes a line's frequency right, the second its amplitude.
+_TURNS_OF_FITTING = 2
 # So many felt lines would agree with a line of the scan by chance that they say nothing.
 _GREATEST_CHANCE = 0.1
 
@@ -68,10 +71,14 @@ class Named:
     also: str = ""
 
 
-def study(signal: ScanSignal, felt: Felt | None = None) -> StudiedScan:
-    """Take form and lines of one scan apart."""
-    formless = without_form(signal)
-    spectrum = find_lines(signal, formless.residual)
+def study(
+    signal: ScanSignal, felt: Felt | None = None, textures: Sequence[float] = ()
+) -> StudiedScan:
+    """Take form and lines of one scan apart.
+
+    textures: waves along the path [1/m] that are known to be there, too fine to be searched for
+    """
+    formless, spectrum = _apart(signal, [texture(frequency) for frequency in textures])
     return StudiedScan(
         signal=signal,
         formless=formless,
@@ -79,6 +86,48 @@ def study(signal: ScanSignal, felt: Felt | None = None) -> StudiedScan:
         lines=(*spectrum.lines, *_order_lines(formless, spectrum)),
         felt=felt,
     )
+
+
+def study_all(scans: Sequence[tuple[ScanSignal, Felt | None]]) -> list[StudiedScan]:
+    """Study scans of one part: first each by itself, then with the textures of the others.
+
+    Where the pace changes, a texture finer than twice the sampling distance has no image that
+    is a line; it is seen all the same, where one knows to look.
+    """
+    studied = [study(signal, felt) for signal, felt in scans]
+    return [
+        study(one.signal, one.felt, finer) if (finer := _finer(one, studied)) else one
+        for one in studied
+    ]
+
+
+def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[float]:
+    path = one.coordinates.get(PATH)
+    if path is None or path.proportional_to_time:
+        return []
+    found = [
+        line.possible[PATH]
+        for other in studied
+        for line in other.lines
+        if other is not one and line.coordinate == PATH and line.possible[PATH] > path.highest
+    ]
+    return sorted(found)
+
+
+def _apart(signal: ScanSignal, known: Sequence[Line]) -> tuple[Formless, LineSpectrum]:
+    """Form and lines, fitted beside each other: a line near an order leaks into it."""
+    form = FormFit(signal)
+    formless = form.without()
+    spectrum = find_lines(signal, formless.residual, known, form.owned())
+    if not spectrum.lines:
+        return formless, spectrum
+    form.refine(sum_of(spectrum.lines, spectrum.coordinates, len(signal)))
+    for _ in range(_TURNS_OF_FITTING):
+        formless = form.without(waves_of(spectrum.lines, spectrum.coordinates))
+        spectrum = find_lines(signal, formless.residual, spectrum.lines, form.owned())
+        if not spectrum.lines:
+            break
+    return formless, spectrum
 
 
 def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
@@ -235,9 +284,7 @@ def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
         return Named(line=line, kind=SYNCHRONOUS, evidence=(text,), order=order)
     if set(line.possible) == {TIME} and len(scan.coordinates) > 1:
         text = "sharp over time, spread over path and turns, for the pace changed"
-        return Named(
-            line=line, kind=VIBRATION, evidence=(text, _or_image(line, scan.signal.rate))
-        )
+        return Named(line=line, kind=VIBRATION, evidence=(text, _or_image(line, scan.signal.rate)))
     against = tuple(
         f"not {t.kind}: missing in {', '.join(done.scans[k].signal.name for k in t.absent)}"
         for t in evidence.tested
@@ -249,9 +296,7 @@ def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
     return Named(line=line, kind=UNDECIDED, evidence=against, needs=asked)
 
 
-def _with_true_frequency(
-    scans: Sequence[StudiedScan], named: dict[Key, Named], key: Key
-) -> Named:
+def _with_true_frequency(scans: Sequence[StudiedScan], named: dict[Key, Named], key: Key) -> Named:
     """A vibration whose true frequency another scan has decided."""
     own = named[key]
     if own.kind != VIBRATION or own.frequency is not None:

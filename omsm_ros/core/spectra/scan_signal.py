@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class ScanSignal:
     @property
     def time(self) -> FloatArray:
         """Since the first sample [s], (n,)."""
-        return self.sample * self.period
+        return np.asarray(self.sample * self.period, np.float64)
 
     @property
     def duration(self) -> float:
@@ -139,7 +140,9 @@ def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
     speed = np.hypot(*pace)
     moving = speed > 0
     unit = [np.divide(p, speed, out=np.zeros_like(p), where=moving) for p in pace]
-    steps = sum(np.diff(p) * 0.5 * (u[1:] + u[:-1]) for p, u in zip((across, along), unit))
+    steps = sum(
+        np.diff(p) * 0.5 * (u[1:] + u[:-1]) for p, u in zip((across, along), unit, strict=True)
+    )
     return np.asarray(np.r_[0.0, np.cumsum(steps)])
 
 
@@ -149,7 +152,8 @@ def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     cuts = np.linspace(0, len(over), parts + 1).astype(np.int64)
     length = np.diff(cuts)
     mean = [np.add.reduceat(v, cuts[:-1]) / length for v in (over, values)]
-    slopes = np.gradient(mean[1]) / np.where(np.gradient(mean[0]) == 0, np.inf, np.gradient(mean[0]))
+    run = np.gradient(mean[0])
+    slopes = np.gradient(mean[1]) / np.where(run == 0, np.inf, run)
     return (cuts[:-1] + cuts[1:] - 1) / 2, slopes
 
 
@@ -177,18 +181,19 @@ class Sampling:
 def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
     """Return the sampling at ``places`` radii, outermost first; one place on a circle."""
     samples = np.diff(signal.sample)
-    distance, middle = abs(np.diff(signal.path)) / samples, 0.5 * (
-        signal.radius[1:] + signal.radius[:-1]
-    )
+    distance = abs(np.diff(signal.path)) / samples
+    middle = 0.5 * (signal.radius[1:] + signal.radius[:-1])
     low, high = float(middle.min()), float(middle.max())
     if high - low < 0.01 * max(high, 1e-12):
-        typical = float(np.median(distance))
-        return [Sampling(radius=float(np.median(middle)), distance=typical, shortest_wavelength=2 * typical)]
-    edges = np.linspace(high, low, places + 1)
-    found = []
-    for outer, inner in zip(edges[:-1], edges[1:], strict=True):
-        chosen = (middle <= outer) & (middle >= inner)
-        if chosen.any():
-            radius, typical = float(np.median(middle[chosen])), float(np.median(distance[chosen]))
-            found.append(Sampling(radius=radius, distance=typical, shortest_wavelength=2 * typical))
-    return found
+        return [_sampling(middle, distance)]
+    rings = [
+        (middle <= outer) & (middle >= inner)
+        for outer, inner in pairwise(np.linspace(high, low, places + 1))
+    ]
+    return [_sampling(middle[ring], distance[ring]) for ring in rings if ring.any()]
+
+
+def _sampling(radius: FloatArray, distance: FloatArray) -> Sampling:
+    typical = float(np.median(distance))
+    middle = float(np.median(radius))
+    return Sampling(radius=middle, distance=typical, shortest_wavelength=2 * typical)

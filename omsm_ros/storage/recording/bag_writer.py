@@ -11,13 +11,14 @@ from types import TracebackType
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.storage import conversions
 from omsm_ros.storage.files import beside, said
 from omsm_ros.storage.message_types import bag_messages, typestore
 from omsm_ros.storage.recording.growing_file import GrowingFile
 from omsm_ros.storage.recording.topics import (
+    ACCELERATION_TOPIC,
     AXES_TOPIC,
     DISTANCE_TOPIC,
     LATCHED_DEPTH,
@@ -142,6 +143,11 @@ class BagWriter:
         """Append a block of the probe at its own stamp."""
         message = conversions.distance_message(bag_messages(), block)
         self.write(DISTANCE_TOPIC, block.stamp_ns, message)
+
+    def write_acceleration(self, block: AccelerationBlock) -> None:
+        """Append a block of the accelerometer at its own stamp."""
+        message = conversions.acceleration_message(bag_messages(), block)
+        self.write(ACCELERATION_TOPIC, block.stamp_ns, message)
 
     def __exit__(
         self,

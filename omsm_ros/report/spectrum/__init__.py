@@ -1,0 +1,1 @@
+"""The page of spectra: every line with its name and its evidence."""

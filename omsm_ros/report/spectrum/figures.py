@@ -1,0 +1,136 @@
+"""Spectra of scans, their lines in the colour of their kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from omsm_ros.core.spectra.density import Density, density, evenly, smoothed
+from omsm_ros.core.spectra.hypotheses import (
+    ARTEFACT,
+    FOLDED,
+    KINDS,
+    PART,
+    SYNCHRONOUS,
+    UNDECIDED,
+    VIBRATION,
+    StudiedScan,
+)
+from omsm_ros.core.spectra.ripple_guard import Named
+from omsm_ros.core.spectra.scan_signal import PATH, TIME
+from omsm_ros.report.common import style
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+# Okabe and Ito, apart for every kind of sight.
+COLOURS = {
+    PART: "#009E73",
+    VIBRATION: "#D55E00",
+    FOLDED: "#CC79A7",
+    SYNCHRONOUS: "#0072B2",
+    ARTEFACT: "#E69F00",
+    UNDECIDED: "#1F2933",
+}
+_WIDTH_IN, _ROW_IN = 9.2, 2.5
+_MOST_NAMED = 8
+
+
+def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
+    """Amplitude spectral density of each scan over time, its lines named."""
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
+    for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
+        signal = studied.signal
+        values = evenly(signal.time, studied.formless.residual, signal.period)
+        _curve(row, density(values, signal.period), 1.0)
+        _marks(row, named, TIME, 1.0, signal.duration)
+        style.label(row, y="nm/√Hz", title=f"{signal.name}, over time")
+    _kinds(axes[0, 0], [row for _, named in scans for row in named])
+    style.label(axes[-1, 0], x="frequency [Hz]", y="nm/√Hz", title=axes[-1, 0].get_title("left"))
+    return made
+
+
+def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+    """Density along the path over wavelength; None where no scan moves over the part."""
+    moving = [(s, n) for s, n in scans if PATH in s.coordinates]
+    if not moving:
+        return None
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(moving) + 0.3, len(moving), 1, sharex=True)
+    for row, (studied, named) in zip(axes[:, 0], moving, strict=True):
+        signal = studied.signal
+        step = float(np.median(np.diff(signal.path) / np.diff(signal.sample)))
+        values = evenly(signal.path, studied.formless.residual, step)
+        _curve(row, density(values, step), MICROMETRE_M, over=True)
+        _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
+        row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
+        style.label(row, y="nm·√mm", title=f"{signal.name}, along the path")
+    title = axes[-1, 0].get_title("left")
+    style.label(
+        axes[-1, 0],
+        x="wavelength [µm]; dotted: twice the sampling distance",
+        y="nm·√mm",
+        title=title,
+    )
+    return made
+
+
+def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) -> None:
+    frequency, level = smoothed(spectrum)
+    place = 1 / frequency / unit if over else frequency
+    height = np.sqrt(level / MILLIMETRE_M if over else level) / NANOMETRE_M
+    axes.loglog(place, height, color=style.MUTED, linewidth=0.8)
+
+
+def _marks(axes: Axes, named: Sequence[Named], coordinate: str, unit: float, extent: float) -> None:
+    """A line of amplitude a stands a²/2 high in one resolution."""
+    for row in named:
+        if coordinate not in row.line.possible:
+            continue
+        at = row.line.possible[coordinate]
+        scale = extent / MILLIMETRE_M if coordinate == PATH else extent
+        height = row.line.amplitude * np.sqrt(scale / 2) / NANOMETRE_M
+        place = 1 / at / unit if coordinate == PATH else at
+        axes.plot([place], [height], "o", color=COLOURS[row.kind], markersize=5, zorder=5)
+
+
+def _kinds(axes: Axes, named: Sequence[Named]) -> None:
+    for kind in KINDS:
+        if any(row.kind == kind for row in named):
+            axes.plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
+    if axes.get_legend_handles_labels()[0]:
+        style.legend_above(axes)
+
+
+def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:
+    """Density of the path's own motion against the calibrated band (Fig. 7c)."""
+    made, axes = style.figure(_WIDTH_IN, 3.0)
+    one = axes[0, 0]
+    for k, (name, spectrum) in enumerate(spectra):
+        frequency, level = smoothed(spectrum)
+        colour = list(COLOURS.values())[k % len(COLOURS)]
+        one.loglog(frequency, np.sqrt(level) / NANOMETRE_M, linewidth=0.9, color=colour, label=name)
+    if valid_up_to is not None:
+        top = max(float(s.frequency[-1]) for _, s in spectra)
+        one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")
+    style.label(one, x="frequency [Hz]", y="nm/√Hz", title="Motion of Z")
+    style.legend(one, loc="upper right")
+    return made
+
+
+def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
+    """Every line of every scan at its frequency in time: what stays is no texture."""
+    made, axes = style.figure(_WIDTH_IN, 0.5 * len(scans) + 1.2)
+    one = axes[0, 0]
+    for level, (_, named) in enumerate(scans):
+        for row in named:
+            if TIME in row.line.possible:
+                at = row.line.possible[TIME]
+                one.plot(
+                    [at, at], [level - 0.35, level + 0.35], color=COLOURS[row.kind], linewidth=1.6
+                )
+    one.set_xscale("log")
+    one.set_yticks(range(len(scans)), [studied.signal.name for studied, _ in scans])
+    one.invert_yaxis()
+    style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")
+    return made
