@@ -51,13 +51,14 @@ def texture(frequency: float) -> Line:
 
 
 def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> Line:
+    """Return a line to start a fit with: the Fourier sum of ``values`` (n,) at ``frequency``."""
     phase = np.exp(-2j * np.pi * frequency * coordinate.values)
     mean = 2 * complex(values @ phase) / len(values)
     return Line(coordinate=coordinate.name, frequency=frequency, cosine=mean.real, sine=-mean.imag)
 
 
 def fitted(lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray) -> list[Line]:
-    """All lines at once: amplitudes first, then frequencies as well."""
+    """Fit all ``lines`` at once to ``values`` (n,): amplitudes first, then frequencies as well."""
     lines = _stepped(lines, coordinates, values, turning=False)
     for _ in range(_FITTING_STEPS):
         lines = _apart(_stepped(lines, coordinates, values, turning=True), coordinates)
@@ -70,7 +71,7 @@ def in_their_coordinates(
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> list[Line]:
-    """The ``new`` among the lines each in the coordinate that takes most of its power.
+    """Return all lines, each ``new`` one in the coordinate that takes most of its power.
 
     Where the pace hardly changes, a spectrum's grid alone may make the wrong one look better.
     """
