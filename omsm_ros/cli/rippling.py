@@ -11,7 +11,7 @@ from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.machine_files import load_surface
+from omsm_ros.storage.surface_file import load_surface
 
 # ------------------------------------------------------------------------------ spectrum
 
