@@ -35,6 +35,7 @@ setup(
             "x3pio>=2; python_version >= '3.11'",
             "SurfaceTopography>=1.20",
         ],
+        "devices": ["pyads"],
         "campaign": ["distributed"],
         "catalogue": ["sqlalchemy>=2", "psycopg[binary]>=3.1"],
     },

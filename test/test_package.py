@@ -29,7 +29,12 @@ ROSDEP = {
 }
 
 # Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.
-OPTIONAL = {"h5py": "formats", "distributed": "campaign", "sqlalchemy": "catalogue"}
+OPTIONAL = {
+    "h5py": "formats",
+    "distributed": "campaign",
+    "pyads": "devices",
+    "sqlalchemy": "catalogue",
+}
 
 
 def parsed(folder):

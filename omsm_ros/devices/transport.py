@@ -17,6 +17,7 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 
 DEFAULT_BAUD_RATE = 921_600
 _CHUNK_BYTES = 65_536
+ADS_SCHEME = "ads://"
 _TCP_SCHEME = "tcp://"
 _SERIAL_SCHEME = "serial://"
 
@@ -169,7 +170,8 @@ class TcpTransport:
 def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport:
     """The transport that ``address`` names.
 
-    ``tcp://host:port``; ``serial:///dev/ttyUSB0?baud=921600`` or the path of a serial port
+    ``tcp://host:port``; ``ads://host?symbol=GVL.omsm`` of a TwinCAT PLC;
+    ``serial:///dev/ttyUSB0?baud=921600`` or the path of a serial port
     (``baud_rate`` where the address has none); any URL that pyserial knows
     (``rfc2217://host:port``). Raises ConfigurationError.
     """
@@ -178,6 +180,10 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
         if not (host and port.isdecimal()):
             raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
         return TcpTransport(host.strip("[]"), int(port))
+    if address.startswith(ADS_SCHEME):
+        from omsm_ros.devices.ads import AdsRing  # few have a PLC to read
+
+        return AdsRing(address)
     if address.startswith(_SERIAL_SCHEME):
         path, _, query = address[len(_SERIAL_SCHEME) :].partition("?")
         name, _, value = query.partition("=")
