@@ -120,8 +120,10 @@ class ResidualSpace:
         if length % 2 == 0:
             weight[-1] = 1.0
         noise = broad_noise(left, np.flatnonzero(used), len(used), length)
+        shared = self.problem.rounded(inverse.T)
         lost = self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-        return np.asarray(np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length)
+        from_noise = np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length
+        return np.asarray(from_noise + shared.T @ shared)
 
 
 def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:

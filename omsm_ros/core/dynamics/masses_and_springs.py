@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, optimize, signal
+from scipy import optimize, signal
 
 from omsm_ros.core.dynamics.response_band import relative_response_jacobian
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
@@ -31,6 +31,7 @@ _SEARCHED = 8.0
 _LEAST_PROMINENCE = 1e-6
 # Of the stated uncertainty, where no coefficient could follow the model.
 _UNSTATED = 0.1
+_INDEFINITE = 1e-9
 # The six guesses race for this many steps; the best of them is followed to its end.
 _RACE_EVALUATIONS = 8
 
@@ -157,11 +158,15 @@ def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     state at all, for it has no coefficient for it, counts ten times as much as its variance.
     """
     stated = jacobian @ covariance @ jacobian.T
-    variance = np.diag(stated)
+    variance = np.maximum(np.diag(stated), 0.0)
     floor = 1e-6 * float(np.max(variance)) or 1.0
     further = _UNSTATED**2 * np.diag(np.maximum(variance, floor))
-    root = np.linalg.cholesky(stated + further)
-    return np.asarray(linalg.solve_triangular(root, np.eye(len(root)), lower=True))
+    total = stated + further
+    deviation = np.sqrt(np.maximum(np.diag(total), np.diag(further)))
+    values, directions = np.linalg.eigh(total / np.outer(deviation, deviation))
+    # Coefficients far apart in size leave a covariance that rounding makes indefinite.
+    least = _INDEFINITE * float(values[-1])
+    return np.asarray((directions / np.sqrt(np.maximum(values, least))).T / deviation)
 
 
 def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:

@@ -77,7 +77,8 @@ def parameter_covariance(
         came = _motion_noise_spectrum(problem, passed, length)
         noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
     weighted = (weight * noise)[:, np.newaxis] * spectrum
-    meat = np.real(np.conj(spectrum).T @ weighted) / length
+    shared = problem.rounded(columns)
+    meat = np.real(np.conj(spectrum).T @ weighted) / length + shared.T @ shared
     unit, scale = unit_columns(columns)
     values, directions = np.linalg.eigh(unit.T @ unit)
     least = _RANK_TOLERANCE * float(values[-1])

@@ -21,7 +21,7 @@ from scipy import fft
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.least_squares import least_squares
 
 _RANK_TOLERANCE = 1e-12
@@ -44,6 +44,8 @@ class Problem:
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
     fits_initial_condition: fit also free decays, of what moved before the first sample
+    plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
+    shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
     """
 
     input: FloatArray
@@ -54,6 +56,23 @@ class Problem:
     rate: float
     noise: float = 0.0
     fits_initial_condition: bool = False
+    plateau: IntArray | None = None
+    shared: float = 0.0
+
+    def rounded(self, columns: FloatArray) -> FloatArray:
+        """Return what one deviation of rounding makes of ``columns`` (k, c), a row an error.
+
+        The compared samples of each plateau share one; a moving one has its own, which the
+        noise at rest does not show. None where no error is shared.
+        """
+        if self.plateau is None or self.shared == 0:
+            return np.zeros((0, columns.shape[1]))
+        plateau = self.plateau[self.used]
+        sums = np.zeros((int(np.max(self.plateau)) + 2, columns.shape[1]))
+        np.add.at(sums, plateau + 1, columns)
+        # Rounding has the variance of its first harmonic times π²/6, which is Σ 1/k².
+        moving = np.pi / np.sqrt(6) * columns[plateau < 0]
+        return np.asarray(np.sqrt(self.shared) * np.concatenate([sums[1:], moving]))
 
     @cached_property
     def closed_length(self) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.fitting.output_error import Problem
+from omsm_ros.core.fitting.reading_steps import plateau_variance, plateaus, reading_step
 from omsm_ros.core.fitting.steps import (
     LEAST_SAMPLES,
     Steps,
@@ -59,7 +60,14 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
-    return Prepared(problem, steps, spikes)
+    return Prepared(_with_reading_steps(problem, steps), steps, spikes)
+
+
+def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
+    """The problem with what the steps of the probe's readings leave open on plateaus."""
+    plateau, seen = plateaus(steps, problem.used), problem.output[problem.used]
+    shared = plateau_variance(seen, plateau[problem.used], reading_step(seen))
+    return replace(problem, plateau=plateau, shared=shared)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:

@@ -172,7 +172,8 @@ def agreement(problem: Problem, best: Fit, up_to: float) -> Finding:
     value = response_agreement(
         frequency_response(problem.input, residual, problem.period, max(segment, 16)), up_to
     )
-    if not np.isfinite(value):
+    # It takes the residual for noise alike everywhere, which rounding without noise is not.
+    if not np.isfinite(value) or problem.shared > 0:
         return Finding({"nonparametric_agreement": None})
     reasons: tuple[str, ...] = ()
     if value > _WORST_AGREEMENT:

@@ -46,6 +46,10 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
     active = problem.used & _active(steps, problem.period)
     rest = problem.used & ~active
     noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
+    moving = problem.used & steps.moving
+    if problem.shared > 0 and np.sum(moving) >= _LEAST_REST_SAMPLES:
+        # Readings that hardly change at rest do not tell the noise: rounding holds it.
+        noise = max(noise, _noise_of_neighbours(on_grid[moving]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2
@@ -61,7 +65,8 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
     """Power of the noise at low frequency over its mean where the axis rests; 1 for white."""
     on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
-    if len(rest) < _LEAST_REST_SAMPLES:
+    # Readings that hardly change at rest do not tell it either.
+    if len(rest) < _LEAST_REST_SAMPLES or problem.shared > 0:
         return 1.0
     rest = rest - np.mean(rest)
     coefficients, variance = autoregression(rest)
@@ -77,8 +82,12 @@ def _active(steps: Steps, period: float) -> BoolArray:
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
     if np.sum(rest) >= _LEAST_REST_SAMPLES:
         return float(np.std(on_grid[rest]))
-    # No rest: white noise is what neighbouring samples do not share.
-    return float(np.sqrt(np.mean(np.diff(on_grid[used], 2) ** 2) / 6.0))
+    return _noise_of_neighbours(on_grid[used])
+
+
+def _noise_of_neighbours(values: FloatArray) -> float:
+    """Standard deviation of white noise, which is what neighbouring samples do not share."""
+    return float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
 
 
 def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:

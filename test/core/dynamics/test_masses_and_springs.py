@@ -107,3 +107,22 @@ def test_the_dip_of_a_driven_mass_is_where_the_other_absorbs():
     assert read.minimum == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
     modes = light.collocated().modes()
     assert read.resonance == pytest.approx(modes[0].frequency, rel=0.01)
+
+
+def test_a_covariance_that_rounding_made_indefinite_is_read_all_the_same():
+    """Coefficients far apart in size: the least eigenvalue is rounding of the largest."""
+    truth = MACHINE.collocated()
+    size = len(truth.numerator) + len(truth.denominator)
+    values = np.concatenate([truth.numerator, truth.denominator[1:], [1e-6]])
+    covariance = 1e-8 * np.outer(values, values)
+    covariance[0] = covariance[:, 0] = 0.0
+    covariance -= 2e-10 * np.diag(np.where(np.arange(size) == 1, values**2, 0.0))
+    assert np.min(np.linalg.eigvalsh(covariance / np.max(covariance))) < 0
+    fitted = fit_two_mass(
+        truth,
+        1e6 * covariance,
+        table_mass=10.0,
+        collocated=True,
+        frequencies=np.linspace(1, 250, 250),
+    )
+    assert np.all(np.isfinite(fitted.uncertainty))
