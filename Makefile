@@ -5,6 +5,8 @@
 SOURCES := $(if $(shell bootstrap/distribution.sh),distribution,wheels)
 VENV := .venv/.from-$(SOURCES)
 MESSAGES := install/.omsm_msgs
+# Interfaces that the wheels lack and every distribution has.
+BORROWED := $(if $(filter wheels,$(SOURCES)),tf2_msgs)
 PACKAGE := install/.omsm_ros
 PEERS := .venv/.peers
 RUN := . ./env.sh &&
@@ -69,8 +71,8 @@ $(PEERS): bootstrap/peers.txt $(PACKAGE)
 	.venv/bin/python -m pip install --quiet --constraint bootstrap/lock.txt --requirement $<
 	@touch $@
 
-$(MESSAGES): $(VENV) bootstrap/build.sh colcon_defaults.yaml $(shell find msg_defs -type f)
-	@bootstrap/build.sh omsm_msgs
+$(MESSAGES): $(VENV) bootstrap/build.sh colcon_defaults.yaml $(shell find msg_defs bootstrap/tf2_msgs -type f)
+	@bootstrap/build.sh omsm_msgs $(BORROWED)
 	@touch $@
 
 $(PACKAGE): $(MESSAGES) setup.py setup.cfg package.xml \

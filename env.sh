@@ -38,12 +38,16 @@ if [ -d "$_omsm_root/.venv/share/rclpy" ]; then
     # A machine without a ROS distribution tries things out: keep off the network unless told.
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 fi
-for _omsm_package in omsm_msgs omsm_ros; do
+for _omsm_package in tf2_msgs omsm_msgs omsm_ros; do
+    # Built where ROS comes from wheels; a distribution has its own.
+    [ "$_omsm_package" != tf2_msgs ] || [ -d "$_omsm_root/install/tf2_msgs" ] || continue
     _omsm_prepend AMENT_PREFIX_PATH "$_omsm_root/install/$_omsm_package"
     for _omsm_folder in "$_omsm_root/install/$_omsm_package"/lib/python3.*/site-packages; do
         _omsm_prepend PYTHONPATH "$_omsm_folder"
     done
 done
+[ ! -d "$_omsm_root/install/tf2_msgs" ] ||
+    _omsm_prepend LD_LIBRARY_PATH "$_omsm_root/install/tf2_msgs/lib"
 _omsm_prepend LD_LIBRARY_PATH "$_omsm_root/install/omsm_msgs/lib"
 _omsm_prepend PYTHONPATH "$_omsm_root" # the source before its installed copy: edits are live
 _omsm_prepend PATH "$_omsm_root/.venv/bin"

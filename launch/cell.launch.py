@@ -1,36 +1,98 @@
-"""Driver, calibrator and corrector of a real cell (needs the full ROS 2 distribution).
+"""A cell: driver, calibrator and corrector, real or emulated, recorded, seen in RViz.
 
-ros2 launch omsm_ros cell.launch.py config:=/path/to/folder
+ros2 launch omsm_ros cell.launch.py params:=/path/to/my_cell
+ros2 launch omsm_ros cell.launch.py emulated:=true namespace:=cell2 record:=scan.mcap
 """
 
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-NODES = ("confocal_driver", "calibrator", "corrector")
+from omsm_ros.emulators.players import EMULATED, emulated
+from omsm_ros.storage.runtime_folder import runtime_folder
+
+SHARE = Path(get_package_share_directory("omsm_ros"))
+ARGUMENTS = {
+    "namespace": ("omsm", "of every node and topic; another one for each cell", None),
+    "device": ("", "what is connected; empty = as the YAML says", None),
+    "emulated": ("false", "start the digital twin and read it", ["true", "false"]),
+    "record": ("", "an .mcap file to record into; empty = none", None),
+    "rviz": ("false", "show the points in RViz", ["true", "false"]),
+    "params": (str(SHARE / "config"), "folder of the nodes' YAML files", None),
+    "log_level": ("info", "of every node", ["debug", "info", "warn", "error", "fatal"]),
+    "respawn": ("false", "start a node again that ended by itself", ["true", "false"]),
+}
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Each node with its YAML of the folder ``config``."""
-    shipped = str(Path(get_package_share_directory("omsm_ros")) / "config")
-    folder = LaunchConfiguration("config")
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument(
-                "config", default_value=shipped, description="folder of the nodes' YAML files"
-            ),
-            *(
-                Node(
-                    package="omsm_ros",
-                    executable=name,
-                    parameters=[PathJoinSubstitution([folder, f"{name}.yaml"])],
-                    output="screen",
-                )
-                for name in NODES
-            ),
-        ]
+    """What is started, once the arguments are known."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, (default, text, choices) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=cell)])
+
+
+def cell(context: LaunchContext) -> list[Node]:
+    """The nodes that the arguments ask for."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
+    nodes = []
+    if given["emulated"] == "true":
+        played, driver = twin(given["namespace"], given["device"] or "six_channel")
+        nodes.append(node(given, "cell_emulator", played))
+    nodes += [
+        node(given, "confocal_driver", driver),
+        node(given, "calibrator", {}),
+        node(given, "corrector", {}),
+    ]
+    if given["record"]:
+        nodes.append(node(given, "recorder", {"path": given["record"]}))
+    if given["rviz"] == "true":
+        nodes.append(rviz(given["namespace"]))
+    return nodes
+
+
+def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Node:
+    """A node with its YAML, and ``parameters`` over it."""
+    file = Path(given["params"]) / f"{name}.yaml"
+    if not file.is_file():
+        # launch would go on with the defaults.
+        raise FileNotFoundError(f"no parameters for {name} at {str(file)!r}; check params:=")
+    return Node(
+        package="omsm_ros",
+        executable=name,
+        namespace=given["namespace"],
+        parameters=[str(file), *([parameters] if parameters else [])],
+        arguments=["--ros-args", "--log-level", given["log_level"]],
+        respawn=given["respawn"] == "true",
+        respawn_delay=1.0,
+        output="screen",
+    )
+
+
+def twin(namespace: str, device: str) -> tuple[dict[str, object], dict[str, object]]:
+    """Parameters of the emulator, and of the driver that reads it."""
+    if device not in EMULATED:
+        raise ValueError(f"device {device!r} has no emulator, expected one of {sorted(EMULATED)}")
+    port = str(runtime_folder(namespace) / "cell")
+    if EMULATED[device].tcp:
+        port = "tcp://127.0.0.1:7000"
+    return (
+        {"device": device, "link": port},
+        {"device": device, "port": port, **emulated(device).driver},
+    )
+
+
+def rviz(namespace: str) -> Node:
+    """RViz, with the layout that is shipped."""
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", str(SHARE / "config" / "cell.rviz")],
+        remappings=[("/omsm/points", f"/{namespace.strip('/')}/points")],
     )

@@ -8,6 +8,7 @@ from typing import Any
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import Quantity, shown
 
+_EXACT = 2**53  # beyond it a float is another number
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
@@ -49,7 +50,7 @@ class Parameter:
         """
         called = f"parameter {self.name!r} ({self.description})"
         kind = type(self.default)
-        if kind is float and type(value) is int:
+        if kind is float and type(value) is int and abs(value) < _EXACT:
             value = float(value)
         if type(value) is not kind:
             raise ConfigurationError(f"{called} is {shown(value)}, expected {_KINDS[kind]}")

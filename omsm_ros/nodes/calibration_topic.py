@@ -50,7 +50,7 @@ class CalibrationTopic:
         )
         if listens:
             topics.listen(
-                node, undo, CalibrationMessage, TOPIC, self._on_message, topics.LATCHED_QOS
+                node, undo, CalibrationMessage, TOPIC, self._on_message, topics.LATCHED_BY_MANY_QOS
             )
 
     def decided(self) -> int:
@@ -66,7 +66,10 @@ class CalibrationTopic:
     def _on_message(self, message: Any, _: topics.MessageInfo) -> None:
         since_ns = self._plausible(conversions.stamp_of(message))
         known = self.calibration
-        if known is not None and (message.id == known.id or since_ns <= self.since_ns):
+        if known is not None and since_ns <= self.since_ns:
+            return
+        if known is not None and message.id == known.id:
+            self.tell(known, since_ns)
             return
         try:
             heard = conversions.calibration(message)

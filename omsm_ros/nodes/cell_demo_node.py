@@ -47,7 +47,10 @@ class DemoNode(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self._status[status.name.removeprefix(_PREFIX)] = values | {"message": status.message}
+            self._status[status.name.removeprefix(_PREFIX)] = values | {
+                "message": status.message,
+                "level": str(status.level[0]),
+            }
 
     def value(self, node: str, key: str) -> int:
         """A count from a node's diagnostics; 0 before the first one."""

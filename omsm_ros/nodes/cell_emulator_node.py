@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from std_srvs.srv import Trigger
@@ -15,6 +16,7 @@ from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.parameters import Parameter
+from omsm_ros.storage.claim import claimed
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.runtime_folder import runtime_folder
 from omsm_ros.twin.disturbances import NOTHING
@@ -73,6 +75,8 @@ class CellEmulatorNode(ManagedNode):
             **{p.name.removeprefix("fault_"): values[p.name] for p in _FAULTS},
         )
         self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
+        if not self._link.startswith("tcp://"):
+            undo.enter_context(claimed(Path(self._link)))
         line = undo.enter_context(line_for(self._link))
         self._player = emulated(values["device"]).player(line, faults)
         undo.callback(self._player.close)

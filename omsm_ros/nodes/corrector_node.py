@@ -25,6 +25,7 @@ from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, options_of, sources_of
 from omsm_ros.nodes.correction_state import CorrectionState
 from omsm_ros.nodes.diagnostics import WARN, Report
+from omsm_ros.nodes.frames import tell_frames
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import MessageInfo, listen
@@ -54,6 +55,7 @@ class CorrectorNode(ManagedNode):
         self._topic = CalibrationTopic(
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
+        tell_frames(self, undo, self._options.geometry, self.values)
         self._aside = Aside(self, undo)
         self._aside.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
         self._aside.serve(undo, PredictError, "~/predict_error", self._on_predict)

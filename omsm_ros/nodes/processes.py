@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -30,11 +31,17 @@ class NodeProcesses:
 
     def start(self, node: str, **parameters: object) -> None:
         """Start ``node`` with ROS parameters."""
-        command = [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args"]
+        self.start_as(node, node, (), **parameters)
+
+    def start_as(
+        self, label: str, node: str, arguments: Sequence[str], **parameters: object
+    ) -> None:
+        """Start ``node``, called ``label`` here, with arguments for ROS and parameters."""
+        command = [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *arguments]
         for name, value in parameters.items():
             command += ["-p", f"{name}:={_parameter_text(value)}"]
-        with (self._folder / f"{node}.log").open("ab") as log:
-            self._running[node] = subprocess.Popen(
+        with (self._folder / f"{label}.log").open("ab") as log:
+            self._running[label] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
 

@@ -27,6 +27,13 @@ LATCHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
 )
+# For who hears several that latch: the last to arrive need not be the newest.
+LATCHED_BY_MANY_QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=20,
+)
 # Requests wait for their turn while a node computes; ten, the usual depth, are soon lost.
 REQUESTS_QOS = QoSProfile(depth=1000)
 

@@ -200,6 +200,11 @@ def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) 
     )
 
 
+def _all_finite(packed: NDArray[np.void]) -> bool:
+    # A device that tells no intensity leaves NaN there, and PCL must know.
+    return all(bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind)
+
+
 def cloud_message(
     messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
 ) -> Any:
@@ -225,5 +230,5 @@ def cloud_message(
         point_step=POINT_DTYPE.itemsize,
         row_step=POINT_DTYPE.itemsize * len(packed),
         data=messages.sequence(packed.view(np.uint8), np.uint8),
-        is_dense=True,
+        is_dense=_all_finite(packed),
     )

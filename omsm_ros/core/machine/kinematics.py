@@ -78,6 +78,15 @@ def workpiece_points(
     )
 
 
+def beam_quaternion(geometry: Geometry) -> tuple[float, float, float, float]:
+    """Return the shortest turn (x, y, z, w) of the Z axis onto the beam, at b = 0."""
+    beam = np.array([geometry.beam_x, geometry.beam_y, 1.0])
+    beam /= np.linalg.norm(beam)
+    turn = np.array([-beam[1], beam[0], 0.0, 1.0 + beam[2]])
+    x, y, z, w = (turn / np.linalg.norm(turn)).tolist()
+    return x, y, z, w
+
+
 def _reach(
     geometry: Geometry, b: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

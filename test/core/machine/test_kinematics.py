@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.machine.kinematics import (
     Geometry,
     WorkpiecePoints,
+    beam_quaternion,
     workpiece_points,
     workpiece_xy,
 )
@@ -106,3 +108,13 @@ def test_a_point_without_tilt_among_tilted_ones_is_the_same_to_the_last_bit() ->
 def test_a_geometry_that_is_no_number_is_named(name: str) -> None:
     with pytest.raises(ConfigurationError, match=name):
         Geometry(**{name: np.nan})
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.2), (0.05, 0.07)])
+def test_the_quaternion_turns_z_onto_the_beam(slopes: tuple[float, float]) -> None:
+    """By the rotation that scipy makes of it; and the shortest one turns about no Z."""
+    x, y, z, w = beam_quaternion(Geometry(beam_x=slopes[0], beam_y=slopes[1]))
+    turned = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
+    beam = np.array([*slopes, 1.0])
+    assert np.allclose(turned, beam / np.linalg.norm(beam), atol=1e-15)
+    assert z == 0

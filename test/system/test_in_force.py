@@ -1,0 +1,110 @@
+"""The topic ``calibration`` tells the one in force, in whatever order nodes are started again."""
+
+import signal
+from dataclasses import replace
+
+import pytest
+from omsm_msgs.msg import Calibration as CalibrationMessage
+from omsm_msgs.srv import LoadCalibration
+
+from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, LATCHED_QOS
+from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+
+pytestmark = pytest.mark.timeout(180)
+
+
+class Listener:
+    """Who joins late: what is latched when it comes."""
+
+    def __init__(self, cell):
+        self._cell, self._heard = cell, {}
+        self._subscription = cell.operator.create_subscription(
+            CalibrationMessage, "/omsm/calibration", self._on_message, LATCHED_BY_MANY_QOS
+        )
+
+    def _on_message(self, message):
+        stamp = message.header.stamp
+        self._heard[stamp.sec * 10**9 + stamp.nanosec] = message.id
+
+    def hears_only(self, calibration):
+        self._cell.wait("what is in force", lambda: calibration.id in self._heard.values())
+        self._cell.settle("corrector", "clouds_published")
+        assert set(self._heard.values()) == {calibration.id}
+
+
+@pytest.fixture
+def two(cell, true_calibration):
+    """Two calibrations, in files of their own outside the calibrator's folder."""
+    made = [replace(true_calibration, settings={"number": k}) for k in range(2)]
+    for k, calibration in enumerate(made):
+        save_calibration(cell.folder / f"{k}.json", calibration)
+    return made
+
+
+def start_calibrator(cell):
+    cell.processes.start("calibrator", output=str(cell.folder / "kept" / "cal.json"))
+
+
+def load(cell, k):
+    path = str(cell.folder / f"{k}.json")
+    return cell.call(LoadCalibration, "corrector/load_calibration", path=path)
+
+
+def until(cell, node, calibration):
+    cell.wait(
+        f"{node} to have it", lambda: cell.operator.text(node, "calibration") == calibration.id
+    )
+
+
+def again(cell, node, start):
+    """Kill a node, start it anew, and wait until the new one has spoken."""
+    cell.processes.end(node, how=signal.SIGKILL)
+    cell.operator._status.pop(node, None)
+    start()
+
+
+def test_through_restarts_in_any_order(cell, two):
+    first, second = two
+    start_calibrator(cell)
+    cell.processes.start("corrector")
+    assert load(cell, 0).success
+    until(cell, "calibrator", first)
+    assert load(cell, 1).success
+    until(cell, "calibrator", second)
+    Listener(cell).hears_only(second)
+    link = cell.folder / "kept" / "cal.json"
+    assert link.is_symlink()
+    assert load_calibration(link).id == second.id
+    assert len(list(link.parent.glob("cal.*.json"))) == 2
+
+    again(cell, "corrector", lambda: cell.processes.start("corrector"))
+    until(cell, "corrector", second)
+    again(cell, "calibrator", lambda: start_calibrator(cell))
+    until(cell, "calibrator", second)
+    Listener(cell).hears_only(second)
+
+    cell.processes.end("calibrator", how=signal.SIGKILL)
+    again(cell, "corrector", lambda: cell.processes.start("corrector"))
+    start_calibrator(cell)
+    until(cell, "corrector", second)
+    Listener(cell).hears_only(second)
+
+
+def test_what_the_corrector_refuses_is_not_in_force(cell, two):
+    first, foreign = two
+    cell.processes.start("corrector", settings='{"number": 0}')
+    assert load(cell, 0).success
+    start_calibrator(cell)
+    until(cell, "calibrator", first)
+    other = cell.operator.create_publisher(CalibrationMessage, "/omsm/calibration", LATCHED_QOS)
+    from omsm_ros.storage import conversions
+
+    now = cell.operator.get_clock().now().nanoseconds
+    message = conversions.calibration_message(conversions.ros_messages(), foreign, now)
+    cell.wait("two listeners", lambda: other.get_subscription_count() >= 2)
+    other.publish(message)
+    cell.wait("the refusal", lambda: "refused" in cell.operator.text("corrector", "message"))
+    assert cell.operator.text("corrector", "calibration") == first.id
+    cell.operator.destroy_publisher(other)
+    until(cell, "calibrator", first)
+    Listener(cell).hears_only(first)

@@ -1,0 +1,146 @@
+"""What a shop sees on /diagnostics: the state now, told by everyone whom it concerns."""
+
+import signal
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from omsm_msgs.msg import AxisBlock, DistanceBlock
+from std_srvs.srv import Trigger
+
+from omsm_ros.emulators.players import emulated
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import save_calibration
+
+pytestmark = pytest.mark.timeout(120)
+
+OK, WARN, ERROR, STALE = (
+    str(level[0])
+    for level in (
+        DiagnosticStatus.OK,
+        DiagnosticStatus.WARN,
+        DiagnosticStatus.ERROR,
+        DiagnosticStatus.STALE,
+    )
+)
+SCALES = emulated("six_channel").driver
+
+
+def until(cell, node, level, words=""):
+    cell.wait(
+        f"{node} to say {words!r} at level {level}",
+        lambda: (
+            cell.operator.text(node, "level") == level
+            and words in cell.operator.text(node, "message")
+        ),
+    )
+
+
+def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
+    cell, true_calibration, small_scan_blocks
+):
+    """Starved, correcting, a gap, every block refused: each a level of its own, and each ends."""
+    path = cell.folder / "cal.json"
+    save_calibration(path, true_calibration)
+    cell.processes.start("corrector", calibration=str(path))
+    until(cell, "corrector", STALE, "no axes has come yet")
+    axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
+    messages = conversions.ros_messages()
+
+    def send(pair, period=None):
+        made = (
+            conversions.axis_message(messages, pair[0]),
+            conversions.distance_message(messages, pair[1]),
+        )
+        for publisher, message in zip((axes, distance), made, strict=True):
+            message.sample_period = period or message.sample_period
+            publisher.publish(message)
+
+    pairs = iter(small_scan_blocks)
+    cell.operator.create_timer(0.1, lambda: send(next(pairs)))
+    until(cell, "corrector", OK, "correcting")
+    lost = sum(len(next(pairs)[0]) for _ in range(7))
+    until(cell, "corrector", WARN, f"axes missing {lost}")
+    assert f"distance missing {lost}" in cell.operator.text("corrector", "message")
+    until(cell, "corrector", OK, "correcting")
+    assert cell.operator.value("corrector", "missing_axes") == lost
+    assert cell.operator.value("corrector", "missing_distance") == lost
+    pairs = iter(())
+    cell.operator.destroy_timer(next(cell.operator.timers))
+    until(cell, "corrector", STALE, "no axes for")
+
+
+def test_two_of_a_kind_are_told_by_both(cell):
+    for label in ("corrector", "second"):
+        cell.processes.start_as(label, "corrector", ["-r", f"__node:={label}"])
+    for node in ("corrector", "second"):
+        cell.wait(
+            f"{node} to notice",
+            lambda node=node: "2 nodes publish /omsm/points" in cell.operator.text(node, "message"),
+        )
+    cell.processes.end("second")
+    cell.wait("peace", lambda: "2 nodes publish" not in cell.operator.text("corrector", "message"))
+
+
+def test_a_second_emulator_is_refused_and_the_first_keeps_its_port(cell):
+    cell.start_emulator()
+    cell.wait("the first", lambda: cell.operator.text("cell_emulator", "message"))
+    cell.processes.start_as("second", "cell_emulator", [], link=cell.link)
+    assert cell.processes._running["second"].wait(30) == 2
+    assert "in use by another process" in (cell.folder / "log" / "second.log").read_text()
+    del cell.processes._running["second"]
+    cell.start_driver()
+    until(cell, "confocal_driver", STALE, "no sample has come yet")
+    # Killed, it holds the port no longer.
+    cell.processes.end("cell_emulator", how=signal.SIGKILL)
+    until(cell, "confocal_driver", ERROR)
+    cell.start_emulator()
+    until(cell, "confocal_driver", STALE)
+
+
+def test_simulated_time_that_nobody_tells_is_told(cell):
+    cell.processes.start("calibrator", use_sim_time=True, output=str(cell.folder / "cal.json"))
+    until(cell, "calibrator", WARN, "nobody publishes /clock")
+
+
+def test_two_cells_side_by_side(cell, true_calibration):
+    """Each measures its own motion, and neither hears a sample of the other."""
+    path = cell.folder / "cal.json"
+    save_calibration(path, true_calibration)
+    cells = {"/omsm": 10_500, "/hall/cell2": 20_000}
+    for namespace in cells:
+        link = str(cell.folder / namespace.strip("/").replace("/", "_"))
+        given = {
+            "cell_emulator": {"link": link, "time_lapse": 20.0, "start_radius": 1e-3},
+            "confocal_driver": {"port": link, **SCALES},
+            "corrector": {"calibration": str(path)},
+        }
+        for node, parameters in given.items():
+            cell.processes.start_as(
+                f"{namespace}{node}".replace("/", "_"),
+                node,
+                ["-r", f"__ns:={namespace}"],
+                **parameters,
+            )
+
+    def name(namespace, node):
+        return f"{namespace}/{node}".removeprefix("/omsm/")
+
+    for namespace in cells:
+        cell.wait(
+            f"the driver of {namespace}",
+            lambda n=namespace: (
+                cell.operator.value(name(n, "confocal_driver"), "axes_subscribers") == 1
+                and cell.operator.value(name(n, "confocal_driver"), "connections") == 1
+            ),
+        )
+    for namespace, motion in (("/omsm", "step_test"), ("/hall/cell2", "scan")):
+        service = f"{namespace}/cell_emulator/{motion}"
+        assert cell.operator.ask(Trigger, service, Trigger.Request()).success
+    for namespace, samples in cells.items():
+        cell.wait(
+            f"all of {namespace}",
+            lambda n=namespace, s=samples: (
+                cell.operator.value(name(n, "corrector"), "distance_received") >= s
+            ),
+        )
+        assert cell.settle(name(namespace, "corrector"), "axes_received") == samples

@@ -1,0 +1,123 @@
+"""What the launch file starts, on stand-ins for launch and launch_ros, which wheels lack."""
+
+import importlib.util
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import omsm_ros
+
+ROOT = Path(omsm_ros.__file__).resolve().parent.parent
+
+
+@dataclass
+class Node:
+    package: str
+    executable: str
+    arguments: list
+    namespace: str = ""
+    parameters: list = field(default_factory=list)
+    remappings: list = field(default_factory=list)
+    respawn: bool = False
+    respawn_delay: float = 0.0
+    output: str = ""
+
+
+class Argument:
+    def __init__(self, name, default_value, description, choices):
+        self.name, self.default = name, default_value
+        assert description
+        assert choices is None or default_value in choices
+
+
+class Configuration:
+    def __init__(self, name):
+        self.name = name
+
+    def perform(self, context):
+        return context[self.name]
+
+
+class Function:
+    def __init__(self, function):
+        self.function = function
+
+
+@pytest.fixture
+def launch(monkeypatch):
+    """Call with arguments; the nodes by their names."""
+    made = {
+        "launch": {"LaunchContext": dict, "LaunchDescription": list},
+        "launch.actions": {"DeclareLaunchArgument": Argument, "OpaqueFunction": Function},
+        "launch.substitutions": {"LaunchConfiguration": Configuration},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": Node},
+        "ament_index_python": {},
+        "ament_index_python.packages": {"get_package_share_directory": lambda _: str(ROOT)},
+    }
+    for name, content in made.items():
+        module = ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    path = ROOT / "launch" / "cell.launch.py"
+    spec = importlib.util.spec_from_file_location("cell_launch", path)
+    file = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(file)
+    *arguments, opaque = file.generate_launch_description()
+
+    def started(**given):
+        context = {argument.name: argument.default for argument in arguments} | given
+        return {node.executable: node for node in opaque.function(context)}
+
+    return started
+
+
+def test_a_real_cell_is_what_its_yaml_says(launch):
+    nodes = launch()
+    assert set(nodes) == {"confocal_driver", "calibrator", "corrector"}
+    for name, node in nodes.items():
+        assert node.parameters == [str(ROOT / "config" / f"{name}.yaml")]
+        assert node.namespace == "omsm"
+        assert not node.respawn
+
+
+@pytest.mark.parametrize("device", ["six_channel", "chrocodile", "chrocodile_packet"])
+def test_an_emulated_cell_reads_what_is_played(launch, device, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    nodes = launch(emulated="true", device=device, namespace="cell2")
+    _, emulator = nodes["cell_emulator"].parameters
+    _, driver = nodes["confocal_driver"].parameters
+    assert emulator["link"] == driver["port"]
+    assert emulator["device"] == driver["device"] == device
+    assert driver["z.counts_per_unit"] > 0
+    assert {node.namespace for node in nodes.values()} == {"cell2"}
+
+
+def test_two_emulated_cells_have_ports_of_their_own(launch, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    links = {
+        launch(emulated="true", namespace=name)["cell_emulator"].parameters[1]["link"]
+        for name in ("omsm", "cell2")
+    }
+    assert len(links) == 2
+
+
+def test_arguments_reach_the_nodes(launch):
+    nodes = launch(record="scan.mcap", rviz="true", log_level="debug", respawn="true")
+    assert nodes["recorder"].parameters[1] == {"path": "scan.mcap"}
+    assert nodes["corrector"].respawn
+    assert nodes["corrector"].arguments == ["--ros-args", "--log-level", "debug"]
+    assert Path(nodes["rviz2"].arguments[1]).is_file()
+
+
+def test_a_folder_without_the_yaml_is_an_error(launch, tmp_path):
+    with pytest.raises(FileNotFoundError, match="confocal_driver"):
+        launch(params=str(tmp_path))
+
+
+def test_what_has_no_emulator_is_named(launch):
+    with pytest.raises(ValueError, match="'confocaldt' has no emulator"):
+        launch(emulated="true", device="confocaldt")
