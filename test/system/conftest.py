@@ -2,8 +2,13 @@
 
 import os
 import time
+from contextlib import contextmanager, suppress
 
 import pytest
+
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.storage.claim import claimed
+from omsm_ros.storage.runtime_folder import runtime_folder
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
@@ -11,10 +16,22 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 @pytest.fixture(scope="session", autouse=True)
 def ros():
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(102 + os.getpid() % 100)
-    rclpy.init()
-    yield
-    rclpy.try_shutdown()
+    with own_domain() as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        rclpy.init()
+        yield
+        rclpy.try_shutdown()
+
+
+@contextmanager
+def own_domain():
+    """One that no other run of these tests on this machine uses."""
+    for k in range(100):
+        domain = 102 + (os.getpid() + k) % 100
+        with suppress(ConfigurationError), claimed(runtime_folder() / f"domain_{domain}"):
+            yield domain
+            return
+    pytest.fail("no free ROS_DOMAIN_ID")
 
 
 class Cell:
