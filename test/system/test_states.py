@@ -106,7 +106,7 @@ def test_two_cells_side_by_side(cell, true_calibration):
     """Each measures its own motion, and neither hears a sample of the other."""
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
-    cells = {"/omsm": 10_500, "/hall/cell2": 20_000}
+    cells = {"/omsm": 29_000, "/hall/cell2": 20_000}
     for namespace in cells:
         link = str(cell.folder / namespace.strip("/").replace("/", "_"))
         given = {
