@@ -30,6 +30,7 @@ PARTS = (
         "real_data",
         "selfcal",
         "form",
+        "budget",
     ),
     "twin",
 )
