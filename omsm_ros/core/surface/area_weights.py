@@ -1,8 +1,9 @@
 """For how much of the surface does each point of a scan stand?
 
-Read off the scan as it ran. Where the path turns about the spindle, each ring of equal area
-counts alike, whatever the feed and the speed were while it was crossed. Elsewhere each cell of
-a grid counts alike that is as fine as the tracks allow.
+Read off the scan as it ran. Where the path turns about the spindle, a point stands for the arc that
+it covers, ``r |Δθ|``, whatever the speed was and however many points beside it were lost; each ring
+of equal area and a few turns counts alike, whatever the feed was while it was crossed. Elsewhere
+each cell of a grid counts alike that is as fine as the tracks allow.
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
 # A raster passes the axis now on this side, now on that, and never gets around it twice.
 _LEAST_TURNS = 2.0
-# Rings so fine that the rim is a thousandth of the area, of points enough for a mean.
-_MOST_RINGS, _POINTS_PER_RING = 2048, 20
+# Rings so fine that the rim is a thousandth of the area, of whole turns and points enough for a
+# mean.
+_MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
+# Across a gap larger than this nobody has looked, and no point stands for it [rad].
+_LARGEST_ARC = np.pi / 6
 # The side of a grid; the number of its cells falls to a quarter as their size doubles where they
 # fill the surface, and to a half where they lie along single tracks.
 _MOST_CELLS, _FILLED = 512, 3.5
@@ -27,9 +31,15 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
     """
     if even:
         return np.ones(len(x))
-    group, area = _rings(x, y) if turns(x, y) >= _LEAST_TURNS else _cells(x, y)
-    points = np.bincount(group, minlength=len(area))
-    weights = (area / np.maximum(points, 1))[group]
+    turned = turns(x, y)
+    share = np.ones(len(x))
+    if turned >= _LEAST_TURNS:
+        group, area = _rings(x, y, turned)
+        share = _arcs(x, y)
+    else:
+        group, area = _cells(x, y)
+    whole = np.bincount(group, share, minlength=len(area))
+    weights = share * (area / np.where(whole > 0, whole, 1.0))[group]
     return np.asarray(weights / np.mean(weights), np.float64)
 
 
@@ -41,13 +51,24 @@ def turns(x: FloatArray, y: FloatArray) -> float:
     return float(abs(angle[-1] - angle[0]) / (2 * np.pi))
 
 
-def _rings(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
+def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, FloatArray]:
     """Return the ring of each point (n,), and the areas of the rings (k,)."""
     square = x**2 + y**2
     inner, span = float(square.min()), float(np.ptp(square))
-    count = int(np.clip(len(x) // _POINTS_PER_RING, 1, _MOST_RINGS)) if span > 0 else 1
+    most = min(len(x) / _POINTS_PER_RING, turned / _TURNS_PER_RING)
+    count = int(np.clip(most, 1, _MOST_RINGS)) if span > 0 else 1
     ring = ((square - inner) * (count / (span or 1.0))).astype(np.int64)
     return np.minimum(ring, count - 1), np.ones(count)
+
+
+def _arcs(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
+    angle = np.unwrap(np.arctan2(y, x))
+    steps = np.minimum(np.abs(np.diff(angle)), _LARGEST_ARC)
+    covered = np.empty(len(x))
+    covered[0], covered[-1] = steps[0], steps[-1]
+    covered[1:-1] = (steps[1:] + steps[:-1]) / 2
+    return np.asarray(np.hypot(x, y) * covered, np.float64)
 
 
 def _cells(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:

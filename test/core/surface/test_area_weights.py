@@ -53,6 +53,29 @@ def test_a_turning_scan_weighs_the_disc_as_it_is(path, form, rms) -> None:
     assert np.average((value - mean) ** 2, weights=weights) == pytest.approx(rms**2, rel=4e-3)
 
 
+def slower_on_one_side() -> Path:
+    """The spindle lingers where x is positive, three times as long as opposite."""
+    share = np.arange(100_000) / 100_000
+    angle = 2 * np.pi * 127 * share
+    return polar(RADIUS * (1 - share), angle - 0.5 * np.sin(angle))
+
+
+def lost_on_one_side() -> Path:
+    """Three points in four are lost where the surface is steep."""
+    x, y = spiral()
+    kept = (x < 0.3 * RADIUS) | (np.arange(len(x)) % 4 == 0)
+    return x[kept], y[kept]
+
+
+@pytest.mark.parametrize("path", [slower_on_one_side, lost_on_one_side])
+def test_within_a_turn_each_part_of_it_counts_by_its_area(path) -> None:
+    x, y = path()
+    weights = area_weights(x, y)
+    assert abs(np.mean(x)) > 0.04 * RADIUS
+    assert abs(np.average(x, weights=weights)) < 0.01 * RADIUS
+    assert np.average(x**2, weights=weights) == pytest.approx(RADIUS**2 / 4, rel=0.01)
+
+
 def test_speed_and_feed_would_mislead_by_a_tenth() -> None:
     x, y = constant_surface_speed()
     assumed = np.hypot(x, y)
