@@ -112,7 +112,7 @@ def drawn(seed: int) -> Disturbances:
                 tilt_rad=(wave("spindle_tilt"),),
             ),
             x_slide_along_z=Straightness(
-                bow_m=size("straightness_x"), half_travel_m=PAPER_MIRROR_RADIUS_M / 2
+                bow_m=size("straightness_x"), half_travel_m=PAPER_MIRROR_RADIUS_M
             ),
             drift=Drift(
                 ramp_m_per_s=size("drift_rate"),
@@ -178,7 +178,7 @@ def deviations(scans: Iterable[Scan]) -> dict[str, list[tuple[float, float]]]:
     """By figure, the error and the stated standard uncertainty of each scan [m]."""
     found: dict[str, list[tuple[float, float]]] = {}
     for made in scans:
-        for name in ("peak_to_valley", "robust_peak_to_valley", "rms_without_noise"):
+        for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
             told, true = made.measured.deviation[name], made.true.deviation[name]
             found.setdefault(name, []).append((told.value - true.value, told.uncertainty))
         told_terms, true_terms = made.measured.zernike, made.true.zernike

@@ -83,7 +83,7 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
     assert points["outliers"] == pytest.approx(int((folder / "dust").read_text()), abs=2)
     figures = found["deviation"]
     true_rms = np.hypot(ASTIGMATISM / np.sqrt(6), COMA / np.sqrt(8))
-    rms = figures["rms_without_noise"]
+    rms = figures["rms"]
     # Along z; the normal leans by up to 1.5 % at the rim.
     assert abs(rms["value"] - true_rms) < 3 * rms["uncertainty"] + 0.012 * true_rms
     assert figures["point_noise"]["value"] == pytest.approx(1e-8, rel=0.05)

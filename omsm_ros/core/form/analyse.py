@@ -11,10 +11,9 @@ from omsm_ros.core.form.figures import (
     DeviationMap,
     Figure,
     noise_of,
-    peak_to_valley,
-    robust_peak_to_valley,
     root_mean_square,
 )
+from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.form.second_order import without_second_order
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
@@ -94,15 +93,17 @@ def analyse_form(
 
 
 def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> dict[str, Figure]:
-    rms, clean = root_mean_square(map_)
     rest = without_second_order(map_)
+    whole, robust = extents_of_part(map_, found.disc)
     return {
-        "peak_to_valley": peak_to_valley(map_, gathered.extent),
-        "robust_peak_to_valley": robust_peak_to_valley(map_),
-        "rms": rms,
-        "rms_without_noise": clean,
-        "peak_to_valley_without_second_order": peak_to_valley(rest, float(np.ptp(rest.deviation))),
-        "rms_without_second_order": root_mean_square(rest)[0],
+        "peak_to_valley": whole,
+        "robust_peak_to_valley": robust,
+        "rms": rms_of_part(map_),
+        "peak_to_valley_without_second_order": extents_of_part(rest, found.disc)[0],
+        "rms_without_second_order": rms_of_part(rest),
+        # As measured: what errors have added is in them.
+        "peak_to_valley_of_points": Figure(gathered.extent, None),
+        "rms_of_points": Figure(root_mean_square(map_), None),
         "point_noise": Figure(map_.noise, None),
         # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
         "rms_before_fit": Figure(found.before, None),

@@ -103,6 +103,7 @@ class Estimate(NamedTuple):
     form: FloatArray
     covariance: FloatArray
     sizes: FloatArray
+    noise: float
 
 
 def estimate(
@@ -140,6 +141,7 @@ def estimate(
         form=found[freedoms:],
         covariance=covariance / np.outer(scale, scale),
         sizes=np.sqrt(sizes),
+        noise=noise,
     )
 
 

@@ -304,7 +304,7 @@ def _over_all(
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))
     found, variance = fit.solved(sums)
-    gain = found.covariance[:free] / max(variance, 1e-24)
+    gain = found.covariance[:free] / found.noise
     # A source that is off by its standard uncertainty moves the pose by one of these columns.
     moved = gain @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
