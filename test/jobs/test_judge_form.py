@@ -105,7 +105,7 @@ def test_with_a_free_pose_terms_carry_what_the_pose_may_have_taken(folder, tmp_p
 def test_people_read_the_figures_too(folder, tmp_path, capsys):
     form(folder, tmp_path, "--fit", "piston,tip,tilt")
     said = capsys.readouterr().out
-    assert "rms without noise" in said
+    assert "rms of points" in said
     assert "not evaluated" in said
     assert f"{POINTS} read" in said
 
