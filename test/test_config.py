@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 import omsm_ros
-from omsm_ros.devices import factory
+from omsm_ros.devices import factory, sensor_factory
 from omsm_ros.storage.surface_file import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
@@ -19,12 +19,14 @@ NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PAR
 TABLES = {
     "confocal_driver": factory.PARAMETERS,
     "axis_driver": factory.AXIS_PARAMETERS,
-    "reference_driver": factory.REFERENCE_PARAMETERS,
+    "reference_driver": sensor_factory.REFERENCE_PARAMETERS,
+    "accelerometer_driver": sensor_factory.ACCELEROMETER_PARAMETERS,
 }
 FRAMES = {
     "confocal_driver": ["machine_frame", "probe_frame"],
     "axis_driver": ["machine_frame"],
     "reference_driver": ["probe_frame"],
+    "accelerometer_driver": ["accelerometer_frame"],
 }
 
 

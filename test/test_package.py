@@ -33,6 +33,7 @@ OPTIONAL = {
     "h5py": "formats",
     "distributed": "campaign",
     "pyads": "devices",
+    "nidaqmx": "devices",
     "sqlalchemy": "catalogue",
 }
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from omsm_ros import quantities
-from omsm_ros.devices.capancdt import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.devices.chrocodile import FORMATS, TRIGGERS, ChrocodileSettings
 from omsm_ros.devices.chrocodile_dollar import ChrocodileDevice
 from omsm_ros.devices.chrocodile_packet import ChrocodilePacketDevice
@@ -41,7 +40,7 @@ _PERIOD = "of the trigger, or of a device that runs freely [s]"
 _STREAMS = ("six_channel", "six_channel_text")
 _CHROCODILES = ("chrocodile", "chrocodile_packet")
 _CONFOCALDTS = ("confocaldt", "confocaldt_ethernet")
-_COMMAND_PORT = Parameter(
+COMMAND_PORT = Parameter(
     "command_port",
     0,
     "TCP port for commands (confocalDT, capaNCDT: 23); 0 = leave it as it is set",
@@ -65,7 +64,8 @@ def _axis_parameters(axis: str, unit: str) -> tuple[Parameter, ...]:
     )
 
 
-def _probe_parameters(full_scale: float) -> tuple[Parameter, ...]:
+def probe_parameters(full_scale: float) -> tuple[Parameter, ...]:
+    """Return range, sign and zero of a sensor of displacement."""
     return (
         Parameter("probe.full_scale", full_scale, "measuring range [m]", quantities.FULL_SCALE),
         Parameter("probe.polarity", 1, "+1: falls as z rises; -1: reversed", choices=_SIGNS),
@@ -73,38 +73,38 @@ def _probe_parameters(full_scale: float) -> tuple[Parameter, ...]:
     )
 
 
-_BLOCK_PARAMETERS = (
+BLOCK_PARAMETERS = (
     Parameter("sample_period", 1e-3, _PERIOD, quantities.SAMPLE_PERIOD),
     Parameter("block_size", 100, "samples in a message", quantities.BLOCK_SAMPLES),
 )
-_PORT = Parameter(
+PORT = Parameter(
     "port", "", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, or a path", required=True
 )
-_DEVICE = Parameter(
+DEVICE = Parameter(
     "device",
     "six_channel",
     "what is connected: see docs/devices.md",
     choices=(*_STREAMS, *_CHROCODILES, *_CONFOCALDTS),
 )
 _STREAM_PARAMETERS = (
-    _PORT,
+    PORT,
     Parameter(
         "baud_rate",
         DEFAULT_BAUD_RATE,
         "of a serial port that does not name its own",
         quantities.BAUD_RATE,
     ),
-    *_BLOCK_PARAMETERS,
+    *BLOCK_PARAMETERS,
     *(p for axis in AXES for p in _axis_parameters(axis, "rad" if axis in "bc" else "m")),
 )
 _COLUMNS = "of a line of text, in order; - = one to pass over"
 
 PARAMETERS = (
-    _DEVICE,
+    DEVICE,
     *_STREAM_PARAMETERS,
     Parameter("trace", "", "file for a trace of the wire; empty = none"),
     Parameter("columns", " ".join(COLUMNS), _COLUMNS),
-    *_probe_parameters(_USUAL.probe.full_scale),
+    *probe_parameters(_USUAL.probe.full_scale),
     Parameter(
         "probe.intensity_full_scale", 100.0, "reading that is intensity 1", quantities.INTENSITY
     ),
@@ -120,7 +120,7 @@ PARAMETERS = (
     Parameter("trigger", "free_run", "what starts a sample", choices=tuple(TRIGGERS)),
     Parameter("format", "binary", "of the telegrams", choices=tuple(FORMATS)),
     Parameter("signals", "", "CHRocodile: for $SODX; confocalDT RS-422: of a frame, in order"),
-    _COMMAND_PORT,
+    COMMAND_PORT,
     Parameter("lamp", -1.0, f"brightness [%]; -1 = {_AS_IT_IS}", quantities.PERCENT, unset=-1.0),
     Parameter("averaging", -1, f"samples; -1 = {_AS_IT_IS}", quantities.AVERAGING, unset=-1),
     Parameter(
@@ -131,19 +131,9 @@ PARAMETERS = (
 
 # Axes alone: the same streams, whose distance, if they have one, is left out.
 AXIS_PARAMETERS = (
-    replace(_DEVICE, choices=_STREAMS),
+    replace(DEVICE, choices=_STREAMS),
     *_STREAM_PARAMETERS,
     Parameter("columns", " ".join(COLUMNS), _COLUMNS),
-)
-
-REFERENCE_PARAMETERS = (
-    replace(_DEVICE, default="capancdt", choices=("capancdt",)),
-    _PORT,
-    _COMMAND_PORT,
-    *_BLOCK_PARAMETERS,
-    Parameter("channel", 1, "of the controller", quantities.CHANNEL),
-    Parameter("triggered", False, "samples come with a trigger from outside"),
-    *_probe_parameters(250e-6),
 )
 
 
@@ -176,25 +166,6 @@ def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
     return make_device(defaults() | dict(values), now_ns)
 
 
-def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """The reference sensor that ``values`` describe, not yet connected.
-
-    values: every name of REFERENCE_PARAMETERS. Raises ConfigurationError.
-    """
-    if values["device"] != "capancdt":
-        raise ConfigurationError(f"device {values['device']!r}, expected 'capancdt'")
-    probe = ProbeReading(
-        full_scale=values["probe.full_scale"],
-        zero=values["probe.zero"],
-        polarity=values["probe.polarity"],
-    )
-    settings = CapaNcdtSettings(
-        **_blocks(values), probe=probe, channel=values["channel"], triggered=values["triggered"]
-    )
-    commands = command_transport(values["port"], values["command_port"])
-    return CapaNcdtDevice(transport_for(values["port"]), settings, now_ns, commands=commands)
-
-
 def _axes(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScaling]:
     """The scaling of every axis; ConfigurationError for one of ``wired`` without a scale."""
     for axis in wired:
@@ -212,14 +183,15 @@ def _axes(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScaling]
     }
 
 
-def _blocks(values: Values) -> dict[str, Any]:
+def block_settings(values: Values) -> dict[str, Any]:
+    """Return what every device is told of its samples."""
     return {"sample_period": values["sample_period"], "block_size": values["block_size"]}
 
 
 def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
     probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
     scaling = StreamScaling(**_axes(values), probe=probe)
-    settings = StreamSettings(**_blocks(values), scaling=scaling)
+    settings = StreamSettings(**block_settings(values), scaling=scaling)
     return GenericStreamDevice(transport, settings, now_ns)
 
 
@@ -227,7 +199,7 @@ def _six_channel_text(values: Values, transport: Transport, now_ns: NowNs) -> St
     probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
     columns = tuple(values["columns"].replace(",", " ").split())
     scaling = StreamScaling(**_axes(values, [a for a in AXES if a in columns]), probe=probe)
-    settings = CsvSettings(**_blocks(values), columns=columns, scaling=scaling)
+    settings = CsvSettings(**block_settings(values), columns=columns, scaling=scaling)
     return CsvStreamDevice(transport, settings, now_ns)
 
 
@@ -238,7 +210,7 @@ def _chrocodile(
     now_ns: NowNs,
 ) -> StreamDevice:
     settings = ChrocodileSettings(
-        **_blocks(values),
+        **block_settings(values),
         signals=_numbers("signals", values["signals"]),
         axes=tuple(_axes(values).values()) if values["encoders"] else None,
         encoders=_encoders(values["encoders"] or "XYZUV"),
@@ -257,14 +229,17 @@ def _chrocodile(
 def _confocaldt(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
     words = tuple(values["signals"].replace(",", " ").split()) or ("distance",)
     settings = ConfocalDtSettings(
-        **_blocks(values), probe=_probe_reading(values), values=words, trigger=values["trigger"]
+        **block_settings(values),
+        probe=_probe_reading(values),
+        values=words,
+        trigger=values["trigger"],
     )
     return ConfocalDtDevice(transport, settings, now_ns)
 
 
 def _confocaldt_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
     settings = ConfocalDtSettings(
-        **_blocks(values),
+        **block_settings(values),
         probe=_probe_reading(values),
         axes=tuple(_axes(values, values["encoders"].lower()).values())
         if values["encoders"]

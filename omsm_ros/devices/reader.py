@@ -91,8 +91,15 @@ class DeviceReader:
         except Exception as err:  # a defect of ours must not end the reading for good
             self._tell(defect(err))
             self.state = State.LOST
-        self._hand_over(self._device.close())
+        self._let_go()
         return any_came
+
+    def _let_go(self) -> None:
+        """Disconnect and hand over the partial block, whatever state the device is in."""
+        try:
+            self._hand_over(self._device.close())
+        except Exception as err:  # a defect of ours must not end the reading for good
+            self._tell(defect(err))
 
     def _connected(self) -> None:
         self.connections += 1

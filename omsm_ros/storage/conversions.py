@@ -48,7 +48,8 @@ def ros_messages() -> Messages:
     from sensor_msgs.msg import PointCloud2, PointField
     from std_msgs.msg import Header
 
-    ours = {name: getattr(msg, name) for name in ("AxisBlock", "DistanceBlock", "Calibration")}
+    names = ("AxisBlock", "DistanceBlock", "AccelerationBlock", "Calibration")
+    ours = {name: getattr(msg, name) for name in names}
     others = {c.__name__: c for c in (Time, Header, PointCloud2, PointField)}
     return Messages({**ours, **others}, _ros_sequence)
 

@@ -10,13 +10,12 @@ from omsm_ros.devices.factory import (
     AXIS_PARAMETERS,
     DEVICES,
     PARAMETERS,
-    REFERENCE_PARAMETERS,
     command_transport,
     defaults,
     make_axes,
     make_device,
-    make_reference,
 )
+from omsm_ros.devices.sensor_factory import REFERENCE_PARAMETERS, make_reference
 from omsm_ros.emulators.players import EMULATED, emulated
 from omsm_ros.errors import ConfigurationError
 

@@ -98,3 +98,18 @@ def test_a_stop_ends_a_long_pause_at_once() -> None:
     stop.set()
     thread.join(5.0)
     assert not thread.is_alive()
+
+
+def test_a_defect_while_the_device_is_let_go_does_not_end_the_reading() -> None:
+    stop = threading.Event()
+
+    class Stubborn(Scripted):
+        def close(self) -> list[BlockPair]:
+            self.closed += 1
+            raise KeyError("the partial block")
+
+    device = Stubborn(stop, [[], []], [DeviceError("pulled"), [BLOCK]])
+    got: list[BlockPair] = []
+    reader = DeviceReader(device, got.extend, lambda _: None, back_off=(1e-3, 4e-3))
+    reader.run(stop)
+    assert (device.closed, got, reader.connections) == (2, [BLOCK], 2)

@@ -14,12 +14,11 @@ import pytest
 
 from omsm_ros.devices.blocks import BlockPair
 from omsm_ros.devices.factory import (
-    REFERENCE_PARAMETERS,
     defaults,
     make_device,
-    make_reference,
 )
 from omsm_ros.devices.reader import DeviceReader, State
+from omsm_ros.devices.sensor_factory import REFERENCE_PARAMETERS, make_reference
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.emulators.chrocodile import ChrocodileEmulator
 from omsm_ros.emulators.instrument import Instrument
