@@ -172,6 +172,7 @@ STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 UNCERTAINTY = Quantity("standard uncertainty", "m", 0.0, 10.0, "give it in metres, k = 1")
 TIME_UNCERTAINTY = Quantity("standard uncertainty", "s", 0.0, 1.0, "give it in seconds, k = 1")
 GAIN_UNCERTAINTY = Quantity("standard uncertainty", "", 0.0, 1e6, "give it as a share, k = 1")
+TOLERANCE = Quantity("tolerance", "m", 1e-12, 1.0, "give it in metres, peak to valley")
 BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2")
 ANGLE_UNCERTAINTY = Quantity(
     "standard uncertainty", "rad", 0.0, 10.0, "give it in radians, k = 1; 10 = not known"

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Facts
 from omsm_ros.core.surface.freedoms import parsed_freedoms
 from omsm_ros.core.surface.placement import Aperture
@@ -53,6 +54,15 @@ def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -
         type=aperture,
         metavar="R[,X,Y]",
         help="disc of the part that counts [m]; without it all points do",
+    )
+
+
+def declare_tolerance(sub: argparse.ArgumentParser) -> None:
+    """Add what a registered part is held against."""
+    sub.add_argument(
+        "--tolerance",
+        type=number(quantities.TOLERANCE),
+        help="of the peak to valley of 99.5 %% [m]; does the part hold it? With --fit",
     )
 
 

@@ -12,7 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import json_object, number
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
-from omsm_ros.cli.fit_option import declare_fit, form_rows
+from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
@@ -95,6 +95,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
         "--override", action="store_true", help="use a calibration that does not belong; recorded"
     )
     declare_fit(sub, None)
+    declare_tolerance(sub)
     declare_catalogue(sub)
 
 
@@ -103,6 +104,8 @@ def _correct(args: argparse.Namespace) -> Facts:
     nominal = load_surface(args.nominal) if args.nominal else None
     if args.fit and nominal is None:
         raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
+    if args.tolerance and not args.fit:
+        raise ConfigurationError("--tolerance needs a deviation to judge; give --fit auto")
     options = CorrectionOptions(
         polarity=args.polarity,
         accept_other_rate=args.override,
@@ -126,6 +129,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             accuracy=args.accuracy,
             fit=args.fit,
             aperture=args.aperture,
+            tolerance=args.tolerance,
             report=not args.no_report,
             progress=progress,
         )

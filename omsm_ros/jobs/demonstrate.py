@@ -36,7 +36,15 @@ from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.disturbance_file import load_disturbances
-from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json
+from omsm_ros.storage.files import (
+    CLOUD,
+    DEVIATION,
+    FORM,
+    REPORT,
+    SUMMARY,
+    SYSTEMATIC,
+    save_json,
+)
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
@@ -159,8 +167,9 @@ class Demonstration:
 
 
 OVERVIEW = "overview.png"
+_FITTED = ("piston", "tip", "tilt")
 _MARK = "made_by_omsm_demo.txt"
-_RESULTS = (CLOUD, SUMMARY, REPORT, OVERVIEW)
+_RESULTS = (CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, OVERVIEW)
 
 
 def conclude(plan: Demonstration) -> dict[str, Any]:
@@ -176,7 +185,9 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
-    summary = measurement.summarise(plan.bag, done, calibration, Judgement(options))
+    judgement = Judgement(options, out=plan.out)
+    summary = measurement.summarise(plan.bag, done, calibration, judgement)
+    measurement.add_form(plan.out, summary, PAPER_MIRROR, _FITTED)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
@@ -192,7 +203,8 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     figures |= calibration_figures(calibration, step_test)
     (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true_response(step_test)))
     save_json(plan.out / SUMMARY, summary)
-    publication.publish(plan.out, TITLE, summary, calibration, figures)
+    surface = publication.map_of(view, PAPER_MIRROR, plan.out)
+    publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
     return summary
 
 

@@ -20,6 +20,8 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of
+from omsm_ros.core.form.conformity import conformity
+from omsm_ros.core.form.figures import Figure
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.errors import DataError
@@ -44,6 +46,7 @@ def measure(
     accuracy: float | None = None,
     fit: Sequence[str] | None = None,
     aperture: Aperture | None = None,
+    tolerance: float | None = None,
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -73,7 +76,7 @@ def measure(
     )
     summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out))
     if fit is not None and nominal is not None and done.statistics:
-        _judge_form(out, summary, nominal, fit, aperture)
+        add_form(out, summary, nominal, fit, aperture, tolerance)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
@@ -91,18 +94,20 @@ def _publish(
     nominal: Surface | None,
 ) -> None:
     # Here, because drawing takes longer to load than a scan to correct.
-    from omsm_ros.jobs.publish import figures_of, publish
+    from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
 
     figures = figures_of(done.points, calibration, nominal, done.sample_period)
-    publish(out, f"Surface of {bag.name}", summary, calibration, figures)
+    surface = map_of(view_of(done.points, done.sample_period), nominal, out)
+    publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
 
 
-def _judge_form(
+def add_form(
     out: Path,
     summary: dict[str, Any],
     nominal: Surface,
     fit: Sequence[str],
-    aperture: Aperture | None,
+    aperture: Aperture | None = None,
+    tolerance: float | None = None,
 ) -> None:
     """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
     # Here, because most corrections do without.
@@ -112,6 +117,10 @@ def _judge_form(
     facts = judge_form(open_measurement(out), nominal, out, fit, aperture)
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
+    if tolerance is not None:
+        figure = Figure(**facts["deviation"]["robust_peak_to_valley"])
+        found = conformity(figure, tolerance)
+        summary["form"]["conformity"] = found.entry() if found else None
 
 
 def summarise(

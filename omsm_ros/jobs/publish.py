@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.errors import FileError
 from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import bode
+from omsm_ros.report.maps.surface_map import EmbeddedMap, Layer, embedded
 from omsm_ros.report.measurement.cloud_view import CloudView
-from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.report.measurement.figures import zernike_terms
+from omsm_ros.report.measurement.gallery import levelled, surface_figures
 from omsm_ros.report.measurement.page import Report, render
-from omsm_ros.storage.files import REPORT, save_text
+from omsm_ros.storage import strict_json
+from omsm_ros.storage.files import DEVIATION, FORM, REPORT, read_text, save_text
+from omsm_ros.storage.maps.read_map import read_points
+
+_MAX_FORM_BYTES = 10_000_000
 
 
 def figures_of(
@@ -52,14 +59,49 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
     )
 
 
+def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
+    """The map that a reader can enlarge; of the registered deviation if ``out`` has one."""
+    if view is None:
+        return None
+    layers = []
+    if (out / DEVIATION).is_file():
+        part = read_points(out / DEVIATION)
+        layers.append(Layer("registered deviation", part.x, part.y, part.height, "nm"))
+    if nominal is None:
+        height = view.height - view.height.min()
+        layers.append(Layer("height", view.x, view.y, height, "µm", symmetric=False))
+    else:
+        heights = {"corrected": (view.height, "nm"), "uncorrected": (view.raw_height, "µm")}
+        for name, (height, unit) in heights.items():
+            level = levelled(view, height, nominal)
+            layers.append(Layer(f"{name}, piston removed", view.x, view.y, level, unit))
+    spread = Layer("uncertainty, k = 1", view.x, view.y, view.uncertainty, "nm", symmetric=False)
+    return embedded([*layers, spread])
+
+
 def publish(
     out: Path,
     title: str,
     summary: Mapping[str, Any],
     calibration: Calibration,
     figures: Mapping[str, bytes],
+    surface: EmbeddedMap | None = None,
 ) -> None:
-    """Write ``report.html`` into ``out``."""
+    """Write ``report.html`` into ``out``; with what ``form.json`` there says of the part.
+
+    surface: map that a reader can enlarge
+    """
     date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    page = render(Report(title, date, summary, calibration=calibration, figures=figures))
+    form = _form_in(out)
+    if form:
+        figures = {**figures, "zernike_terms": style.png(zernike_terms(form["zernike"]))}
+    page = render(Report(title, date, summary, calibration, figures, form, surface))
     save_text(out / REPORT, page)
+
+
+def _form_in(out: Path) -> dict[str, Any]:
+    """The content of ``form.json`` in ``out``; empty where the part was not registered."""
+    if not (out / FORM).is_file():
+        return {}
+    text = read_text(out / FORM, _MAX_FORM_BYTES, FileError, "form")
+    return strict_json.object_of(text, FileError, f"form {str(out / FORM)!r}")

@@ -41,13 +41,14 @@ def surface_figures(
     heights = {"raw": cloud.raw_height, "corrected": cloud.height}
     if true_height is not None:
         heights["true"] = true_height
-    deviations = {
-        name: form.level(
-            cloud.x, cloud.y, form.deviation(cloud.x, cloud.y, h, nominal), weights=weights
-        )
-        for name, h in heights.items()
-    }
+    deviations = {name: levelled(cloud, h, nominal) for name, h in heights.items()}
     return {**made, **_maps(cloud, deviations), **_profiles(cloud, deviations)}
+
+
+def levelled(cloud: CloudView, height: FloatArray, nominal: Surface) -> FloatArray:
+    """Return ``height`` (n,) [m] less the nominal surface and its mean over the area."""
+    away = form.deviation(cloud.x, cloud.y, height, nominal)
+    return form.level(cloud.x, cloud.y, away, weights=area_weights(cloud.x, cloud.y))
 
 
 def _error_trace(cloud: CloudView, left: FloatArray | None) -> bytes:

@@ -12,6 +12,13 @@ from omsm_ros.report.common import tables
 from omsm_ros.report.common.tables import part
 from omsm_ros.report.common.template import check_places, fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
+from omsm_ros.report.maps.surface_map import EmbeddedMap, policy_of, script
+from omsm_ros.report.measurement.part import (
+    limits_table,
+    provenance_table,
+    removed_table,
+    verdict_on_part,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +55,13 @@ DYNAMICS = {
     ),
     "step_response": Caption("One edge of the step test, and what the model leaves of it."),
 }
-CAPTIONS = {**MAPS, **PROFILES, **ERRORS, **DYNAMICS}
+FORM = {
+    "zernike_terms": Caption(
+        "Terms of the deviation, each one at the rim, with their expanded uncertainty (k = 2). "
+        "Grey: no larger than it."
+    ),
+}
+CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +75,8 @@ class Report:
         ``warnings``, ``settings``, ``versions``; lengths in metres
     calibration: that was applied, if any
     figures: PNG files by the names in :data:`CAPTIONS`
+    form: the content of ``form.json``, if the part was registered
+    map: that a reader can enlarge
 
     Raises ConfigurationError for a figure of another name.
     """
@@ -71,6 +86,8 @@ class Report:
     summary: Mapping[str, Any]
     calibration: Calibration | None = None
     figures: Mapping[str, bytes] = field(default_factory=dict)
+    form: Mapping[str, Any] = field(default_factory=dict)
+    map: EmbeddedMap | None = None
 
     def __post_init__(self) -> None:
         check_places(self.figures, CAPTIONS)
@@ -87,10 +104,15 @@ class Headline:
 
 def render(report: Report) -> str:
     """The page as HTML; all text from outside is escaped."""
+    drawing = script() if report.map else ""
     return fill(
         "report.html",
         report=report,
+        on_part=verdict_on_part(report.summary, report.form),
         verdict=verdict_on_measurement(report.summary, report.calibration),
+        removed=removed_table(report.summary, report.form),
+        script=drawing,
+        script_policy=policy_of(drawing),
         headlines=headlines(report.summary),
         sections=_sections(report),
         records=_records(report),
@@ -137,6 +159,7 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
     groups = {
         "Surface": MAPS,
         "Profiles": PROFILES,
+        "Form": FORM,
         "Dynamic error": ERRORS,
         "Dynamics of the probe": DYNAMICS,
     }
@@ -146,10 +169,13 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
 
 def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
+    verdict = verdict_on_measurement(summary, report.calibration)
     found = [
         tables.error_table(summary),
         tables.budget_table(summary),
+        tables.Table("What stands against trust", (), [(reason,) for reason in verdict.reasons]),
         tables.motion_table(summary),
+        limits_table(summary),
         tables.sample_table(summary),
     ]
     if report.calibration is not None:
@@ -159,5 +185,6 @@ def _records(report: Report) -> list[tables.Table]:
     settings = part(summary, "settings") or {}
     if report.calibration is None or settings != dict(report.calibration.settings):
         found.append(tables.mapping_table("Settings", settings))
+    found.append(provenance_table(summary))
     found.append(tables.mapping_table("Versions", part(summary, "versions") or {}))
     return [table for table in found if table.rows]

@@ -1,0 +1,119 @@
+"""What the page says of the part, of what was taken out, of limits, and of where it is from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from omsm_ros.readable import NOTHING, measured, plain, quantity
+from omsm_ros.report.common.tables import Table, part
+from omsm_ros.report.common.verdict import Verdict
+
+_FIGURES = {
+    "peak_to_valley": "peak to valley",
+    "robust_peak_to_valley": "peak to valley of 99.5 %",
+    "rms": "rms",
+}
+_CONFORMITY = {
+    "holds": ("good", "The part holds its tolerance"),
+    "fails": ("bad", "The part fails its tolerance"),
+    "cannot tell": ("care", "Too uncertain to tell whether the part holds its tolerance"),
+}
+_POSE_UNITS = {
+    "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
+    "power": "1/m",
+}  # fmt: skip
+
+
+def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verdict | None:
+    """The deviation of the part, and whether it holds its tolerance; None without a nominal."""
+    deviation = part(form, "deviation")
+    if deviation:
+        told = [
+            f"{name} {_expanded(deviation[key])}"
+            for key, name in _FIGURES.items()
+            if part(deviation, key, "value") is not None
+        ]
+    elif raw := part(summary, "deviation", "corrected"):
+        told = [
+            f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",
+            f"rms {quantity(raw['rms_area_weighted'], 'm')} by area",
+            "uncertainties of these are not evaluated: fit the part's pose, as --fit auto",
+        ]
+    else:
+        return None
+    held = part(summary, "form", "conformity")
+    if not held:
+        told.append("no tolerance was given (--tolerance), so it is for you to say")
+        return Verdict("unknown", "Deviation from nominal", tuple(told))
+    level, word = _CONFORMITY[held["verdict"]]
+    if level == "good" and part(summary, "light", "level") != "green":
+        # The uncertainty of what nobody looked at is not in it.
+        level, word = "care", f"By what was evaluated, {word[0].lower()}{word[1:]}"
+    tolerance = quantity(held["tolerance"], "m")
+    return Verdict(level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(told))
+
+
+def _expanded(figure: Mapping[str, Any]) -> str:
+    """A figure with its expanded uncertainty, k = 2."""
+    spread = figure.get("uncertainty")
+    if spread is None:
+        return f"{quantity(figure['value'], 'm')}, its uncertainty not evaluated"
+    return f"{measured(figure['value'], 2 * spread, 'm')} (k = 2)"
+
+
+def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
+    """What is no longer in the deviation: pose, and what the surface does not determine."""
+    title, columns = "Taken out", ("value", "standard uncertainty")
+    if not form:
+        rows = []
+        if part(summary, "deviation", "corrected"):
+            rows = [("piston, the unknown stand-off of the probe", "mean of the area", NOTHING)]
+        return Table(title, columns, rows)
+    rows = []
+    for name in part(form, "removed", "fitted") or ():
+        pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
+        rows.append((name, _size(pose.get("value"), unit), _size(pose.get("uncertainty"), unit)))
+    refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
+    rows += [(f"not {name}", str(why), NOTHING) for name, why in refused.items()]
+    return Table(title, columns, rows)
+
+
+def _size(value: Any, unit: str) -> str:
+    if value is None:
+        return NOTHING
+    return plain(value) + " 1/m" if unit == "1/m" else quantity(value, unit)
+
+
+def limits_table(summary: Mapping[str, Any]) -> Table:
+    """What bounds the speed of this motion, the tightest first."""
+    limits = sorted(
+        part(summary, "prediction", "limits") or (), key=lambda limit: limit["speed_factor"]
+    )
+    rows = [
+        (
+            str(limit["name"]),
+            _size_of(limit["value"], limit["unit"]),
+            _size_of(limit["allowed"], limit["unit"]),
+            f"{plain(limit['speed_factor'])} ×",
+        )
+        for limit in limits
+    ]
+    return Table("Limits of the motion", ("on this scan", "allowed", "may run faster by"), rows)
+
+
+def _size_of(value: Any, unit: str) -> str:
+    return quantity(value, unit) if unit else plain(value)
+
+
+def provenance_table(summary: Mapping[str, Any]) -> Table:
+    """From which recording and by which calibration."""
+    admission = part(summary, "admission")
+    rows = [
+        ("recording", str(part(summary, "bag") or NOTHING)),
+        ("calibration", str(part(summary, "calibration") or NOTHING)),
+        ("overridden", "yes" if part(admission or {}, "overridden") else "no"),
+        ("files", ", ".join(map(str, (part(summary, "files") or {}).values())) or NOTHING),
+    ]
+    known = [row for row in rows if row[1] != NOTHING]
+    return Table("Provenance", (), known if part(summary, "bag") else [])

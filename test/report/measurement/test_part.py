@@ -1,0 +1,105 @@
+"""Is the part good? What the page says of it first, and of what it rests on."""
+
+from __future__ import annotations
+
+import pytest
+
+from omsm_ros.report.measurement.part import (
+    limits_table,
+    provenance_table,
+    removed_table,
+    verdict_on_part,
+)
+
+FORM = {
+    "deviation": {
+        "peak_to_valley": {"value": 171e-9, "uncertainty": 30e-9},
+        "robust_peak_to_valley": {"value": 124e-9, "uncertainty": 20e-9},
+        "rms": {"value": 21.6e-9, "uncertainty": None},
+    },
+    "pose": {
+        "piston": {"value": 1.5e-9, "uncertainty": 0.2e-9},
+        "tip": {"value": 50e-6, "uncertainty": 2e-6},
+        "power": {"value": 0.25, "uncertainty": 0.01},
+    },
+    "removed": {
+        "fitted": ["piston", "tip", "power"],
+        "not_determined": {"clocking": "a sphere looks alike from all sides"},
+    },
+}
+
+
+def summary(verdict=None, light="green"):
+    found = {"light": {"level": light}}
+    if verdict:
+        held = {"verdict": verdict, "value": 124e-9, "expanded": 40e-9, "tolerance": 200e-9}
+        found["form"] = {"conformity": held}
+    return found
+
+
+@pytest.mark.parametrize(
+    ("verdict", "light", "level", "word"),
+    [
+        ("holds", "green", "good", "The part holds its tolerance of 200 nm"),
+        ("holds", "amber", "care", "By what was evaluated, the part holds"),
+        ("fails", "green", "bad", "The part fails its tolerance of 200 nm"),
+        ("fails", "amber", "bad", "The part fails its tolerance of 200 nm"),
+        ("cannot tell", "green", "care", "Too uncertain to tell"),
+    ],
+)
+def test_a_tolerance_is_answered_first(verdict, light, level, word):
+    found = verdict_on_part(summary(verdict, light), FORM)
+    assert found.level == level
+    assert found.word.replace("\u202f", " ").startswith(word)
+
+
+def test_without_a_tolerance_nothing_is_called_good():
+    found = verdict_on_part(summary(), FORM)
+    assert found.level == "unknown"
+    assert "no tolerance was given" in found.reasons[-1]
+
+
+def test_every_figure_comes_with_its_expanded_uncertainty():
+    reasons = [r.replace("\u202f", " ") for r in verdict_on_part(summary(), FORM).reasons]
+    assert "peak to valley 171 nm ± 60 nm (k = 2)" in reasons
+    assert any(r.startswith("rms 21.6 nm, its uncertainty not evaluated") for r in reasons)
+
+
+def test_a_part_that_was_not_registered_says_so():
+    raw = {"deviation": {"corrected": {"peak_to_valley": 1e-7, "rms_area_weighted": 1e-8}}}
+    found = verdict_on_part(raw, {})
+    assert any("uncertainties of these are not evaluated" in r for r in found.reasons)
+    assert removed_table(raw, {}).rows[0][0].startswith("piston")
+
+
+def test_without_a_nominal_surface_there_is_no_verdict_on_the_part():
+    assert verdict_on_part({}, {}) is None
+    assert not removed_table({}, {}).rows
+
+
+def test_what_was_taken_out_has_units_and_reasons():
+    rows = [tuple(c.replace("\u202f", " ") for c in r) for r in removed_table({}, FORM).rows]
+    assert rows[0] == ("piston", "1.50 nm", "0.200 nm")
+    assert rows[1] == ("tip", "50.0 µrad", "2.00 µrad")
+    assert rows[2][1] == "0.250 1/m"
+    assert rows[3][:2] == ("not clocking", "a sphere looks alike from all sides")
+
+
+def test_the_tightest_limit_comes_first():
+    limits = [
+        {"name": "dynamics", "value": 6e-9, "allowed": 25e-9, "unit": "m", "speed_factor": 20.0},
+        {"name": "spindle", "value": 30.0, "allowed": 120.0, "unit": "rpm", "speed_factor": 4.0},
+    ]
+    table = limits_table({"prediction": {"limits": limits}})
+    assert [row[0] for row in table.rows] == ["spindle", "dynamics"]
+    assert "4.00" in table.rows[0][-1]
+    assert not limits_table({}).rows
+
+
+def test_provenance_names_recording_and_calibration():
+    told = {"bag": "scan.mcap", "calibration": "c0ffee", "admission": {"overridden": True}}
+    rows = dict(provenance_table(told).rows)
+    assert rows["recording"] == "scan.mcap"
+    assert rows["calibration"] == "c0ffee"
+    assert rows["overridden"] == "yes"
+    assert not provenance_table({}).rows
