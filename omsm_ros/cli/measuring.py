@@ -20,7 +20,7 @@ from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits, ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
-from omsm_ros.jobs.measure import measure
+from omsm_ros.jobs.measure import Registering, measure
 from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
@@ -127,9 +127,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
-            fit=args.fit,
-            aperture=args.aperture,
-            tolerance=args.tolerance,
+            register=Registering(args.fit, args.aperture, args.tolerance) if args.fit else None,
             report=not args.no_report,
             progress=progress,
         )

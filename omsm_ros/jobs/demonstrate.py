@@ -167,7 +167,7 @@ class Demonstration:
 
 
 OVERVIEW = "overview.png"
-_FITTED = ("piston", "tip", "tilt")
+_REGISTERING = measurement.Registering(("piston", "tip", "tilt"))
 _MARK = "made_by_omsm_demo.txt"
 _RESULTS = (CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, OVERVIEW)
 
@@ -187,7 +187,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     step_test = planned_test_of(plan.scenario, plan.disturbances)
     judgement = Judgement(options, out=plan.out)
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
-    measurement.add_form(plan.out, summary, PAPER_MIRROR, _FITTED)
+    measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,19 @@ from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, save_json
 
 
+@dataclass(frozen=True)
+class Registering:
+    """How a part is registered to its nominal surface, and judged.
+
+    freedoms: of the fit, or "auto";  aperture: of the part, None for all points
+    tolerance: of the peak to valley of 99.5 % [m], if there is one
+    """
+
+    freedoms: Sequence[str]
+    aperture: Aperture | None = None
+    tolerance: float | None = None
+
+
 def measure(
     bag: Path,
     calibration: Calibration,
@@ -44,9 +57,7 @@ def measure(
     by_stamps: ByStamps | None = None,
     stated: MachineSources = NOTHING_STATED,
     accuracy: float | None = None,
-    fit: Sequence[str] | None = None,
-    aperture: Aperture | None = None,
-    tolerance: float | None = None,
+    register: Registering | None = None,
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -57,7 +68,7 @@ def measure(
     lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
-    fit, aperture: freedoms in which the points are registered to ``nominal``, and within which disc
+    register: how the points are registered to ``nominal``; None: they are not
     report: False leaves out the page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
@@ -75,8 +86,8 @@ def measure(
         progress=progress,
     )
     summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out))
-    if fit is not None and nominal is not None and done.statistics:
-        add_form(out, summary, nominal, fit, aperture, tolerance)
+    if register is not None and nominal is not None and done.statistics:
+        add_form(out, summary, nominal, register)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
@@ -101,25 +112,18 @@ def _publish(
     publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
 
 
-def add_form(
-    out: Path,
-    summary: dict[str, Any],
-    nominal: Surface,
-    fit: Sequence[str],
-    aperture: Aperture | None = None,
-    tolerance: float | None = None,
-) -> None:
+def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Registering) -> None:
     """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
     # Here, because most corrections do without.
     from omsm_ros.jobs.judge_form import judge_form
     from omsm_ros.jobs.measured_portions import open_measurement
 
-    facts = judge_form(open_measurement(out), nominal, out, fit, aperture)
+    facts = judge_form(open_measurement(out), nominal, out, register.freedoms, register.aperture)
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
-    if tolerance is not None:
+    if register.tolerance is not None:
         figure = Figure(**facts["deviation"]["robust_peak_to_valley"])
-        found = conformity(figure, tolerance)
+        found = conformity(figure, register.tolerance)
         summary["form"]["conformity"] = found.entry() if found else None
 
 
