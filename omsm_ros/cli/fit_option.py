@@ -66,6 +66,7 @@ def declare_tolerance(sub: argparse.ArgumentParser) -> None:
     )
 
 
+_UNITLESS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 
@@ -77,7 +78,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
     ]
     rows += [(f"{n} not fitted", why) for n, why in removed["not_determined"].items()]
     rows += [
-        (name.replace("_", " "), _figure(figure, "m"))
+        (name.replace("_", " "), _figure(figure, _UNITLESS.get(name, "m")))
         for name, figure in facts["deviation"].items()
     ]
     others = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read")

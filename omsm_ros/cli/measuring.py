@@ -25,7 +25,7 @@ from omsm_ros.jobs.read_bag import path_in
 from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
 from omsm_ros.storage.machine_files import load_geometry, load_limits
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
@@ -113,7 +113,9 @@ def _correct(args: argparse.Namespace) -> Facts:
         geometry=geometry_of(args.geometry),
     )
     with (
-        result_folder(args.out, (CLOUD, SYSTEMATIC, DEVIATION, FORM, REPORT, SUMMARY)) as out,
+        result_folder(
+            args.out, (CLOUD, SYSTEMATIC, DEVIATION, CURVES, FORM, REPORT, SUMMARY)
+        ) as out,
         progress_bar("correcting", args.json) as progress,
     ):
         summary = measure(

@@ -12,7 +12,7 @@ from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.placement import FREEDOMS, Aperture
 from omsm_ros.jobs.measured_portions import Measurement
-from omsm_ros.storage.files import DEVIATION, FORM, save_json
+from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
 from omsm_ros.storage.maps.vertex_file import write_ply
 
 _NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
@@ -24,11 +24,15 @@ def judge_form(
     out: Path,
     asked: Sequence[str],
     aperture: Aperture | None = None,
+    filters: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return what ``form.json`` says of it.
 
-    Writes form.json and deviation.ply into ``out``: deviation along the normal over the part's x
-    and y. asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
+    Writes into ``out`` form.json, curves.json (profiles and power spectral densities) and
+    deviation.ply: deviation along the normal over the part's x and y.
+
+    asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
+    filters: wavelengths of the S- and the L-filter [m], None for what the points allow
 
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
@@ -39,9 +43,11 @@ def judge_form(
         sources=measured.sources,
         aperture=aperture,
         even=measured.even,
+        filters=filters,
     )
     facts = form_facts(form, measured)
     save_json(out / FORM, facts)
+    save_json(out / CURVES, _curves(form))
     write_ply(out / DEVIATION, _deviations(form))
     return facts
 
@@ -77,9 +83,26 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
             "radius": form.aperture.radius,
             "x": form.aperture.x,
             "y": form.aperture.y,
+            "s_filter": form.bands.s_filter,
+            "l_filter": form.bands.l_filter,
+            "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},
             "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",
         },
         "points": form.counts,
+    }
+
+
+def _curves(form: Form) -> dict[str, Any]:
+    density = form.density
+    return {
+        "profiles": {name: curve.entry() for name, curve in form.profiles.items()},
+        "psd": {
+            "radial": density.radial.entry(),
+            "azimuthal": density.azimuthal.entry(),
+            "mean_square": density.mean_square,
+            "normalisation": "two-sided areal density [m^4] over frequency [1/m]; the integral of "
+            "2 pi f times it, and of that over direction [m^2/rad], are mean_square [m^2]",
+        },
     }
 
 

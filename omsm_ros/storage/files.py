@@ -15,7 +15,7 @@ from omsm_ros.storage import strict_json
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 SYSTEMATIC = "systematic.npz"
-FORM, DEVIATION = "form.json", "deviation.ply"
+FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
 """The files of a measurement."""
 
 

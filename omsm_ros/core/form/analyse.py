@@ -7,14 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.form.figures import (
     DeviationMap,
     Figure,
     noise_of,
     root_mean_square,
 )
+from omsm_ros.core.form.optical_terms import optical_terms
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
-from omsm_ros.core.form.second_order import without_second_order
+from omsm_ros.core.form.power_density import Curve, PowerDensity, power_density
+from omsm_ros.core.form.profiles import profiles
+from omsm_ros.core.form.removal import without_form, without_second_order
+from omsm_ros.core.form.texture import Bands, bands_of, texture
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -44,7 +49,8 @@ class Form:
 
     registration: how it sits;  aperture: the disc of the part on which it is judged
     map: its deviations, of all points or of half a million and more, evenly chosen
-    deviation: figures by their name [m];  zernike: terms of the deviation, one at the rim
+    deviation: figures by their name;  zernike: terms of the deviation, one at the rim
+    bands: wavelengths of the filters;  profiles, density: curves of the map
     counts: of the points, by what became of them; they add up to "read"
     """
 
@@ -53,6 +59,9 @@ class Form:
     map: DeviationMap
     deviation: dict[str, Figure]
     zernike: ZernikeFit
+    bands: Bands
+    profiles: dict[str, Curve]
+    density: PowerDensity
     counts: dict[str, int]
 
 
@@ -64,6 +73,7 @@ def analyse_form(
     sources: Sequence[str] = (),
     aperture: Aperture | None = None,
     even: bool = False,
+    filters: tuple[float | None, float | None] = (None, None),
 ) -> Form:
     """Register the points and judge what they deviate by.
 
@@ -71,6 +81,7 @@ def analyse_form(
     asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
     aperture: of the part; None: the disc about the part's origin that holds all points
     even: the points are those of an evenly spaced grid, each of the same area
+    filters: wavelengths of the S- and the L-filter [m], None for what the points allow
 
     Raises DataError for points that are too few, do not fit, or do not determine a freedom.
     """
@@ -82,12 +93,19 @@ def analyse_form(
     map_ = gathered.map(found, even)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
+    cells = Cells.of(map_)
+    formless = Cells.of(without_form(map_, found.disc))
+    bands = bands_of(cells, *filters)
+    figures = _figures(map_, gathered, found) | optical_terms(map_, zernike)
     return Form(
         registration=found,
         aperture=found.disc,
         map=map_,
-        deviation=_figures(map_, gathered, found),
+        deviation=figures | texture(cells, formless, bands),
         zernike=zernike,
+        bands=bands,
+        profiles=profiles(map_, found.disc),
+        density=power_density(cells),
         counts=gathered.counts,
     )
 

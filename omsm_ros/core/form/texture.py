@@ -1,0 +1,112 @@
+"""Texture and slope of a map: ISO 25178-2 parameters, band-limited rms, ISO 10110-14 slopes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.form.cells import Cells
+from omsm_ros.core.form.figures import Figure
+from omsm_ros.core.samples.blocks import FloatArray
+
+_NOISE_SEED = 21
+# An S-filter below this many cells would pass what cells fold; beyond it half a sine passes.
+_LEAST_CELLS = 3.0
+# Ends of the bands, as shares of the longest side: form, waviness, and what is finer.
+_BANDS = {"form": (np.inf, 1 / 4), "waviness": (1 / 4, 1 / 20), "finer": (1 / 20, 0.0)}
+_DEFAULT_L = 1 / 4
+
+
+@dataclass(frozen=True, slots=True)
+class Bands:
+    """Wavelengths [m] at which half passes: of the S- and the L-filter, and of the bands of rms."""
+
+    s_filter: float
+    l_filter: float
+    rms_bands: dict[str, tuple[float | None, float]]
+
+
+def bands_of(cells: Cells, s_filter: float | None = None, l_filter: float | None = None) -> Bands:
+    """Return the wavelengths asked for, or else three cells, and a quarter of the longest side."""
+    across = max(cells.present.shape) * cells.pitch
+    shortest = max(s_filter or 0.0, _LEAST_CELLS * cells.pitch)
+    ends = {
+        name: (None if long == np.inf else long * across, max(short * across, shortest))
+        for name, (long, short) in _BANDS.items()
+    }
+    found = {name: (long, short) for name, (long, short) in ends.items() if (long or 1e9) > short}
+    return Bands(shortest, l_filter or _DEFAULT_L * across, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Filtered:
+    """One band of the cells: the map, the map under as much noise again, and what errors do."""
+
+    values: FloatArray
+    noisier: FloatArray
+    effects: FloatArray
+
+    def figure(self, of: Callable[[FloatArray], float]) -> Figure:
+        """Return a figure of the values, its uncertainty from noise and from every effect."""
+        value = of(self.values)
+        noise = (of(self.noisier) - value) / (np.sqrt(2) - 1)
+        shares = [(of(self.values + e) - of(self.values - e)) / 2 for e in self.effects]
+        return Figure(value, float(np.sqrt(noise**2 + np.sum(np.square(shares)))))
+
+
+def texture(cells: Cells, formless: Cells, bands: Bands) -> dict[str, Figure]:
+    """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
+
+    formless: the same cells after the F-operation, of which the L-filter leaves the fine part
+    """
+    surface = _band(formless, bands.l_filter, bands.s_filter)
+    found = {name: surface.figure(of) for name, of in _PARAMETERS.items()}
+    for name, (long, short) in bands.rms_bands.items():
+        found[f"rms_{name}"] = _band(formless if long else cells, long, short).figure(_rms)
+    smooth = _band(cells, None, bands.s_filter, whole=True)
+    found["slope_rms"] = smooth.figure(lambda image: _slopes(image, cells)[0])
+    found["slope_largest"] = smooth.figure(lambda image: _slopes(image, cells)[1])
+    return found
+
+
+def _band(cells: Cells, long: float | None, short: float, whole: bool = False) -> _Filtered:
+    """Return what has wavelengths from ``short`` to ``long``: present cells, or whole images."""
+    more = np.random.default_rng(_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
+    images = np.concatenate([[cells.mean, more], cells.effects])
+    fine = cells.smoothed(images, short)
+    if long is not None:
+        fine = fine - cells.smoothed(images, long)
+    rows = fine if whole else fine[:, cells.present]
+    return _Filtered(rows[0], rows[0] + rows[1], rows[2:])
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean((values - values.mean()) ** 2)))
+
+
+def _moment(values: FloatArray, order: int) -> float:
+    size = _rms(values)
+    return float(np.mean(((values - values.mean()) / size) ** order)) if size > 0 else 0.0
+
+
+_PARAMETERS: dict[str, Callable[[FloatArray], float]] = {
+    "Sa": lambda values: float(np.mean(np.abs(values - values.mean()))),
+    "Sq": _rms,
+    "Sz": lambda values: float(np.ptp(values)),
+    "Ssk": lambda values: _moment(values, 3),
+    "Sku": lambda values: _moment(values, 4),
+}
+
+
+def _slopes(image: FloatArray, cells: Cells) -> tuple[float, float]:
+    """Return rms and largest slope over two cells, where all neighbours are there."""
+    here = cells.present
+    inside = here[1:-1, 2:] & here[1:-1, :-2] & here[2:, 1:-1] & here[:-2, 1:-1]
+    if not np.any(inside):
+        return 0.0, 0.0
+    along_x = (image[1:-1, 2:] - image[1:-1, :-2])[inside]
+    along_y = (image[2:, 1:-1] - image[:-2, 1:-1])[inside]
+    steep = np.hypot(along_x, along_y) / (2 * cells.pitch)
+    return float(np.sqrt(np.mean(steep**2))), float(steep.max())

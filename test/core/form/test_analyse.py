@@ -1,0 +1,67 @@
+"""The whole of it, on points of any arrangement."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.form.analyse import analyse_form
+from omsm_ros.core.surface.nominal import Flat, Sphere
+from omsm_ros.core.surface.placement import Aperture, Portion
+from omsm_ros.errors import DataError
+
+RNG = np.random.default_rng(6)
+
+
+def form(x, y, height, *asked, **options):
+    portion = Portion(x, y, height, np.empty((0, len(x))))
+    return analyse_form(Flat(), lambda: [portion], asked or ("auto",), **options)
+
+
+@pytest.mark.parametrize("arrangement", ["profile", "strip", "random", "ring", "raster"])
+def test_any_arrangement_of_points_is_judged(arrangement):
+    """A ripple of 10 nm on a tilted flat: its rms is found wherever the points lie."""
+    n = 20_000
+    x, y = RNG.uniform(-0.02, 0.02, (2, n))
+    if arrangement == "profile":
+        x, y = np.linspace(-0.02, 0.02, n), np.zeros(n)
+    elif arrangement == "strip":
+        y = y / 20
+    elif arrangement == "ring":
+        angle = np.linspace(0, 60 * np.pi, n)
+        r = np.linspace(0.012, 0.02, n)
+        x, y = r * np.cos(angle), r * np.sin(angle)
+    elif arrangement == "raster":
+        x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-0.02, 0.02, 140),) * 2))
+    height = 1e-5 * x + 10e-9 * np.sin(2 * np.pi * x / 4e-3)
+    found = form(x, y, height, even=arrangement == "raster")
+    assert found.deviation["rms"].value == pytest.approx(10e-9 / np.sqrt(2), rel=0.05)
+    assert found.counts["used"] == len(x)
+    for name, figure in found.deviation.items():
+        assert figure.value is None or np.isfinite(figure.value), name
+        assert figure.uncertainty is None or figure.uncertainty >= 0, name
+    # A ripple along x: that is where the spectrum has it.
+    if arrangement != "profile":
+        turn = found.density.azimuthal
+        angle = turn.position[np.argmax(turn.value)]
+        assert min(angle, np.pi - angle) < 0.2
+
+
+def test_every_point_is_accounted_for():
+    x, y = RNG.uniform(-0.02, 0.02, (2, 5000))
+    height = np.nan_to_num(Sphere(0.019).height(x, y)) + RNG.normal(0, 1e-8, 5000)
+    height[:7] = np.nan
+    height[100:120] += 1e-5
+    portion = Portion(x, y, height, np.empty((0, 5000)))
+    found = analyse_form(Sphere(0.019), lambda: [portion], ("piston",), aperture=Aperture(0.015))
+    counts = dict(found.counts)
+    assert counts.pop("read") == 5000 == sum(counts.values())
+    assert counts["not_finite"] >= 7
+    assert counts["beyond_surface"] > 0
+    assert counts["outside_aperture"] > 0
+    inside = np.hypot(x[100:120], y[100:120]) < 0.015
+    assert counts["outliers"] == pytest.approx(int(inside.sum()), abs=1)
+
+
+def test_an_aperture_beside_the_points_is_refused():
+    x, y = RNG.uniform(-0.02, 0.02, (2, 5000))
+    with pytest.raises(DataError, match="0 points lie on the nominal surface"):
+        form(x, y, 0 * x, aperture=Aperture(0.001, 0.5, 0.0))

@@ -1,0 +1,132 @@
+"""Cells, filters, texture and spectra of waves whose figures are known in closed form."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.form.cells import Cells
+from omsm_ros.core.form.figures import DeviationMap
+from omsm_ros.core.form.power_density import power_density
+from omsm_ros.core.form.texture import bands_of, texture
+
+SIDE = 20e-3
+
+
+def square(shape, noise=0.0, points=400, effects=None):
+    """A map of a square, evenly measured; ``shape(x, y)`` [m]."""
+    x, y = np.meshgrid(*(np.linspace(0, SIDE, points),) * 2)
+    x, y = x.ravel(), y.ravel()
+    value = shape(x, y) + noise * np.random.default_rng(1).normal(size=len(x))
+    rows = np.empty((0, len(x))) if effects is None else np.array([e(x, y) for e in effects])
+    return DeviationMap(x=x, y=y, deviation=value, area=np.ones(len(x)), effects=rows, noise=noise)
+
+
+def wave(length, size=10e-9, angle=0.0):
+    return lambda x, y: (
+        size * np.sin(2 * np.pi / length * (x * np.cos(angle) + y * np.sin(angle)) + 0.3)
+    )
+
+
+def test_a_cell_is_the_mean_of_its_points():
+    cells = Cells.of(square(lambda x, y: 1e-6 * x + 2e-6 * y, noise=0.0))
+    assert np.all(cells.present)
+    steps = np.diff(cells.mean, axis=1)
+    assert np.median(steps) == pytest.approx(1e-6 * cells.pitch, rel=0.1)
+    assert cells.mean.mean() == pytest.approx(1.5e-6 * SIDE, rel=0.01)
+
+
+@pytest.mark.parametrize("length", [1.5e-3, 4e-3])
+def test_half_of_a_wave_passes_at_the_cutoff(length):
+    """ISO 16610-21: the transmission at the cutoff is one half."""
+    cells = Cells.of(square(wave(length)))
+    passed = cells.smoothed(cells.mean, length)
+    inner = (slice(None), slice(40, -40))
+    assert np.std(passed[inner]) / np.std(cells.mean[inner]) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_filter_does_not_drag_the_edge_down():
+    cells = Cells.of(square(lambda x, y: 1e-6 + 0 * x))
+    np.testing.assert_allclose(cells.smoothed(cells.mean, 3e-3), 1e-6, rtol=1e-12)
+
+
+def test_parameters_of_a_sine_are_those_of_the_textbook():
+    """Sq = a/√2, Sa = 2a/π, Ssk = 0, Sku = 1.5, slope 2π a/λ/√2."""
+    length, size = 3e-3, 10e-9
+    cells = Cells.of(square(wave(length, size)))
+    found = texture(cells, cells, bands_of(cells, None, 15e-3))
+    # An S-filter of a seventh of the wavelength takes 1.4 % of it.
+    assert found["Sq"].value == pytest.approx(size / np.sqrt(2), rel=0.03)
+    assert found["Sa"].value == pytest.approx(2 * size / np.pi, rel=0.03)
+    assert found["Sz"].value == pytest.approx(2 * size, rel=0.06)
+    assert found["Ssk"].value == pytest.approx(0.0, abs=0.1)
+    assert found["Sku"].value == pytest.approx(1.5, abs=0.1)
+    slope = 2 * np.pi * size / length / np.sqrt(2)
+    assert found["slope_rms"].value == pytest.approx(slope, rel=0.05)
+    # From a quarter to a twentieth of the side: what the one Gaussian passes and the other does not.
+    passed = np.exp2(-((SIDE / 20 / length) ** 2)) - np.exp2(-((SIDE / 4 / length) ** 2))
+    assert found["rms_waviness"].value == pytest.approx(passed * size / np.sqrt(2), rel=0.04)
+
+
+def test_noise_is_in_the_uncertainty_and_an_effect_too():
+    quiet = square(wave(2e-3, 1e-9))
+    noisy = square(wave(2e-3, 1e-9), noise=2e-8, effects=[wave(2e-3, 5e-10)])
+    for name in ("Sq", "Sa", "Sz", "slope_rms"):
+        true, found = (
+            texture(Cells.of(m), Cells.of(m), bands_of(Cells.of(m)))[name] for m in (quiet, noisy)
+        )
+        assert abs(found.value - true.value) < 2 * found.uncertainty
+        assert found.uncertainty > 0.2 * abs(found.value - true.value)
+    bare = square(wave(2e-3, 1e-9), effects=[wave(2e-3, 5e-10)])
+    cells = Cells.of(bare)
+    found = texture(cells, cells, bands_of(cells))["Sq"]
+    assert found.uncertainty == pytest.approx(0.5 * found.value, rel=0.02)
+
+
+def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
+    cells = Cells.of(square(wave(2e-3)))
+    assert bands_of(cells, 1e-3, 8e-3).l_filter == 8e-3
+    assert bands_of(cells, 1e-3, 8e-3).s_filter == 1e-3
+    assert bands_of(cells, 1e-9).s_filter == 3 * cells.pitch
+
+
+# ---------------------------------------------------------------------- spectral densities
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
+def test_the_density_holds_the_mean_square_and_where_it_is(angle):
+    """Parseval in the plane, over radial frequency and over direction; the wave's own place."""
+    cells = Cells.of(square(wave(1.25e-3, angle=angle)))
+    found = power_density(cells)
+    step_x, step_y = found.x[1], found.y[1]
+    assert found.areal.sum() * step_x * step_y == pytest.approx(found.mean_square, rel=1e-12)
+    assert found.mean_square == pytest.approx(0.5e-16, rel=0.02)
+    turn = found.azimuthal
+    assert turn.value.sum() * np.pi / len(turn.value) == pytest.approx(found.mean_square, rel=1e-9)
+    assert abs(turn.position[np.argmax(turn.value)] - angle) < 0.1
+    radial = found.radial
+    total = np.sum(2 * np.pi * radial.position * radial.value) * step_x
+    assert total == pytest.approx(found.mean_square, rel=0.05)
+    assert radial.position[np.argmax(radial.value)] == pytest.approx(800.0, rel=0.05)
+
+
+def test_the_density_of_noise_is_flat_and_of_the_known_height():
+    """White noise of variance σ² on cells of pitch d has the density σ² d² everywhere."""
+    map_ = square(lambda x, y: 0 * x, noise=1e-8)
+    cells = Cells.of(map_)
+    found = power_density(cells).radial
+    height = np.mean(cells.noise**2) * cells.pitch**2
+    middle = found.value[5:-5]
+    assert np.mean(middle) == pytest.approx(height, rel=0.05)
+    # All of it is noise, and the uncertainty says so.
+    assert np.all(middle < 2.5 * found.uncertainty[5:-5])
+
+
+def test_a_strip_and_a_disc_have_cells_too():
+    x, y = np.random.default_rng(2).uniform(-1, 1, (2, 40_000))
+    for chosen in (np.abs(y) < 0.06, x**2 + y**2 < 1):
+        n = int(chosen.sum())
+        map_ = DeviationMap(x=x[chosen], y=y[chosen], deviation=1e-9 * x[chosen],
+                            area=np.ones(n), effects=np.empty((0, n)), noise=0.0)  # fmt: skip
+        cells = Cells.of(map_)
+        assert cells.present.mean() > 0.6
+        assert np.isfinite(texture(cells, cells, bands_of(cells))["Sq"].value)
+        assert power_density(cells).mean_square >= 0

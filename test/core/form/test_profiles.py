@@ -1,0 +1,76 @@
+"""Profiles and optical terms of maps that are known in closed form."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.form.figures import DeviationMap
+from omsm_ros.core.form.optical_terms import optical_terms
+from omsm_ros.core.form.profiles import profiles
+from omsm_ros.core.form.removal import without_form
+from omsm_ros.core.form.zernike_fit import fit_zernikes
+from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values
+
+DISC = Aperture(10e-3, 1e-3, -2e-3)
+
+
+def disc_map(sizes, noise=0.0, effects=(), points=60_000):
+    rng = np.random.default_rng(4)
+    r, angle = np.sqrt(rng.uniform(0, 1, points)), rng.uniform(-np.pi, np.pi, points)
+    u, v = r * np.cos(angle), r * np.sin(angle)
+
+    def shape(terms):
+        values = zernike_values(u, v, list(terms))
+        return np.array(list(terms.values())) @ values
+
+    return DeviationMap(
+        x=DISC.x + DISC.radius * u, y=DISC.y + DISC.radius * v, area=np.ones(points),
+        deviation=shape(sizes) + noise * rng.normal(size=points),
+        effects=np.array([shape(e) for e in effects]).reshape(len(effects), points), noise=noise,
+    )  # fmt: skip
+
+
+def test_profiles_run_where_they_say():
+    """Astigmatism is ρ² along x, −ρ² along y, nothing at 45°, and cos 2θ around."""
+    found = profiles(disc_map({Term(2, 2): 1e-8}, noise=1e-10), DISC)
+    for name, sign in (("x", 1), ("y", -1), ("diagonal", 0)):
+        curve = found[name]
+        expected = sign * 1e-8 * (curve.position / DISC.radius) ** 2
+        off = (curve.value - expected)[3:-3]
+        assert np.max(np.abs(off)) < 6e-10
+    around = found["angle"]
+    shape = np.cos(2 * around.position)
+    size = float(around.value @ shape / (shape @ shape))
+    assert size == pytest.approx(1e-8 * (1 - (2 / 3) ** 4) / 2 / (1 - (2 / 3) ** 2), rel=0.02)
+    assert np.max(np.abs(found["radius"].value)) < 1e-9
+
+
+def test_what_is_unknown_of_a_profile_is_noise_and_effects():
+    map_ = disc_map({Term(2, 0): 1e-8}, noise=1e-9, effects=({Term(1, 1): 3e-9},))
+    curve = profiles(map_, DISC)["x"]
+    rim = np.abs(curve.position) > 0.9 * DISC.radius
+    assert np.mean(curve.uncertainty[rim]) == pytest.approx(3e-9 * 0.95, rel=0.05)
+    middle = np.abs(curve.position) < 0.05 * DISC.radius
+    assert np.all(curve.uncertainty[middle] < 8e-10)
+
+
+def test_terms_of_the_standard_are_those_of_known_zernikes():
+    """Power 20 nm at the rim, spherical 10, astigmatism 5: ISO 10110-5, 3.3 to 3.5."""
+    sizes = {Term(2, 0): 20e-9, Term(4, 0): 10e-9, Term(2, 2): 5e-9}
+    map_ = disc_map(sizes, effects=({Term(2, 0): 1e-9},))
+    fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC, effects=map_.effects)
+    found = optical_terms(map_, fit)
+    assert found["iso10110_A"].value == pytest.approx(40e-9, rel=1e-6)
+    assert found["iso10110_A"].uncertainty == pytest.approx(2e-9, rel=1e-3)
+    irregular = np.hypot(10e-9 / np.sqrt(5), 5e-9 / np.sqrt(6))
+    assert found["iso10110_RMSi"].value == pytest.approx(irregular, rel=0.01)
+    assert found["iso10110_RMSa"].value == pytest.approx(5e-9 / np.sqrt(6), rel=0.01)
+    # Power is no irregularity, nor is what may be wrong with it.
+    assert found["iso10110_RMSi"].uncertainty < 1e-13
+    assert 10e-9 < found["iso10110_B"].value < 26e-9
+
+
+def test_form_goes_and_ripple_stays():
+    sizes = {Term(2, 2): 50e-9, Term(3, 1): 15e-9, Term(12, 0): 4e-9}
+    rest = without_form(disc_map(sizes), DISC)
+    assert np.std(rest.deviation) == pytest.approx(4e-9 / np.sqrt(13), rel=0.03)
