@@ -61,7 +61,7 @@ def test_parameters_of_a_sine_are_those_of_the_textbook():
     assert found["Sku"].value == pytest.approx(1.5, abs=0.1)
     slope = 2 * np.pi * size / length / np.sqrt(2)
     assert found["slope_rms"].value == pytest.approx(slope, rel=0.05)
-    # From a quarter to a twentieth of the side: what the one Gaussian passes and the other does not.
+    # From a quarter to a twentieth of the side: what one Gaussian passes and the other not.
     passed = np.exp2(-((SIDE / 20 / length) ** 2)) - np.exp2(-((SIDE / 4 / length) ** 2))
     assert found["rms_waviness"].value == pytest.approx(passed * size / np.sqrt(2), rel=0.04)
 
