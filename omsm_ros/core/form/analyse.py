@@ -11,6 +11,7 @@ from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.form.figures import (
     DeviationMap,
     Figure,
+    noise_beside,
     noise_of,
     root_mean_square,
 )
@@ -200,5 +201,6 @@ class _Gathered:
             deviation=rows[2],
             area=area_weights(rows[0], rows[1], even=even),
             effects=rows[3:],
-            noise=min(float(np.median(self._noise)), found.noise),
+            # Points need not come in the order of a path; then their neighbours are elsewhere.
+            noise=min(float(np.median(self._noise)), noise_beside(*rows[:3]), found.noise),
         )

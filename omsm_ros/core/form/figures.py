@@ -76,3 +76,11 @@ def noise_of(deviation: FloatArray) -> float:
     if len(deviation) < 3:
         return 0.0
     return float(np.median(np.abs(np.diff(deviation, 2))) * 1.4826 / np.sqrt(6))
+
+
+def noise_beside(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
+    """Return the same of points (n,) in any order: from each to those beside it in strips of y."""
+    span_x, span_y = float(np.ptp(x)), float(np.ptp(y))
+    spacing = np.sqrt(span_x * span_y / max(len(x), 1))
+    strip = np.floor((y - y.min()) / (2 * spacing)) if spacing > 0 else np.zeros(len(y))
+    return noise_of(deviation[np.lexsort((x, strip))])

@@ -5,6 +5,7 @@ import pytest
 
 from omsm_ros.core.form.figures import (
     DeviationMap,
+    noise_beside,
     noise_of,
     root_mean_square,
     weighted_quantiles,
@@ -115,3 +116,13 @@ def test_noise_is_told_from_form_and_drift():
 def test_quantiles_are_by_weight():
     values, weights = np.array([3.0, 1.0, 2.0]), np.array([1.0, 2.0, 1.0])
     assert weighted_quantiles(values, weights, (0.25, 0.625)) == (1.0, 2.0)
+
+
+def test_noise_is_told_from_ripple_in_any_order_of_points():
+    """In random order successive points are far apart; those beside each other are not."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-0.02, 0.02, (2, 40_000))
+    value = 1e-7 * np.sin(2 * np.pi * x / 4e-3) + rng.normal(0, 1e-9, 40_000)
+    assert noise_of(value) > 5e-8
+    assert 0.9e-9 < noise_beside(x, y, value) < 6e-9
+    assert noise_beside(x, 0 * y, value) == pytest.approx(1e-9, rel=0.1)
