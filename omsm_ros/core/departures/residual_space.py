@@ -16,6 +16,7 @@ from scipy import fft, stats
 
 from omsm_ros.core.fitting.covariance import noise_spectrum
 from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.uneven_noise import uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.least_squares import orthonormal
 
@@ -120,10 +121,10 @@ class ResidualSpace:
         if length % 2 == 0:
             weight[-1] = 1.0
         noise = broad_noise(left, np.flatnonzero(used), len(used), length)
-        shared = self.problem.rounded(inverse.T)
+        uneven = uneven_rows(self.problem, inverse.T, self.fitted.residual)
         lost = self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
         from_noise = np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length
-        return np.asarray(from_noise + shared.T @ shared)
+        return np.asarray(from_noise + uneven.T @ uneven)
 
 
 def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:

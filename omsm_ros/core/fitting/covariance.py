@@ -7,6 +7,7 @@ from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.uneven_noise import uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.least_squares import unit_columns
 
@@ -77,8 +78,8 @@ def parameter_covariance(
         came = _motion_noise_spectrum(problem, passed, length)
         noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
     weighted = (weight * noise)[:, np.newaxis] * spectrum
-    shared = problem.rounded(columns)
-    meat = np.real(np.conj(spectrum).T @ weighted) / length + shared.T @ shared
+    uneven = uneven_rows(problem, columns, residual)
+    meat = np.real(np.conj(spectrum).T @ weighted) / length + uneven.T @ uneven
     unit, scale = unit_columns(columns)
     values, directions = np.linalg.eigh(unit.T @ unit)
     least = _RANK_TOLERANCE * float(values[-1])

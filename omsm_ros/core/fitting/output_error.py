@@ -59,21 +59,6 @@ class Problem:
     plateau: IntArray | None = None
     shared: float = 0.0
 
-    def rounded(self, columns: FloatArray) -> FloatArray:
-        """Return what one deviation of rounding makes of ``columns`` (k, c), a row an error.
-
-        The compared samples of each plateau share one; a moving one has its own, which the
-        noise at rest does not show. None where no error is shared.
-        """
-        if self.plateau is None or self.shared == 0:
-            return np.zeros((0, columns.shape[1]))
-        plateau = self.plateau[self.used]
-        sums = np.zeros((int(np.max(self.plateau)) + 2, columns.shape[1]))
-        np.add.at(sums, plateau + 1, columns)
-        # Rounding has the variance of its first harmonic times π²/6, which is Σ 1/k².
-        moving = np.pi / np.sqrt(6) * columns[plateau < 0]
-        return np.asarray(np.sqrt(self.shared) * np.concatenate([sums[1:], moving]))
-
     @cached_property
     def closed_length(self) -> int:
         """Samples of one period."""

@@ -47,6 +47,19 @@ def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Findi
     return Finding({"chi_square": chi_square, "noise_m": noise}, limits, tuple(reasons))
 
 
+def timing(scatter: float) -> Finding:
+    """Reserve a record whose readings scatter in time by ``scatter`` [s]."""
+    if scatter == 0:
+        return Finding({"timing_scatter_s": 0.0})
+    return Finding(
+        {"timing_scatter_s": scatter},
+        reservations=(
+            f"the readings scatter in time by {quantity(scatter, 's')}: in a scan they are "
+            "noisier by that times the speed along Z; latch encoder and probe by one trigger",
+        ),
+    )
+
+
 def _what_to_check(clearly_better: int | None) -> str:
     if clearly_better is not None:
         return f"the order asked for is wrong, {clearly_better} poles tell far more"
@@ -117,6 +130,7 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     # What the motion cannot tell makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
+    lambda e: timing(e.residual.timing),
     lambda e: departures(e.searched),
     lambda e: independence(e.searched.survey.independence),
     lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),

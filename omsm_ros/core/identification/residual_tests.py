@@ -16,6 +16,7 @@ from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import orthonormal
 
@@ -30,11 +31,13 @@ _FINEST_READING_M = 1e-10
 @dataclass(frozen=True)
 class ResidualTests:
     """chi_square: mean square where the axis moves over that of noise;  noise: [m]
+    timing: standard deviation of the time of a reading [s], 0 where it does not show
     whiteness, independence: p-values, small where the residual is coloured or follows the motion
     """
 
     chi_square: float
     noise: float
+    timing: float
     whiteness: float
     independence: float
 
@@ -52,10 +55,14 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
         noise = max(noise, _noise_of_neighbours(on_grid[moving]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
-    chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / noise**2
+    timing = scatter_in_time(problem, fitted.residual)
+    moves = active if np.any(active) else problem.used
+    expected = noise**2 + timing * float(np.mean(rate_of(problem)[moves] ** 2))
+    chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / expected
     return ResidualTests(
         chi_square,
         noise,
+        float(np.sqrt(timing)),
         whiteness(fitted.residual),
         independence(fitted.residual, np.gradient(problem.input)[problem.used]),
     )

@@ -1,0 +1,49 @@
+"""Noise that comes with speed: triggers that scatter in time.
+
+A reading that is δ late is off by δ times the rate of the motion. Where δ is random this is
+noise, from sample to sample anew, in proportion to the rate; what a model misses is not, for it
+lasts longer than a sample.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+
+# Standard deviations beyond which an excess, or a correlation, is no chance.
+_CLEARLY = 5.0
+_LEAST_STILL = 200
+# Of the greatest rate squared: slower is at rest.
+_STILL = 1e-4
+# Second differences of white noise share their noise: Σ ρ² over all lags.
+_SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
+
+
+def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
+    """Variance [s²] of the time of a reading, from a residual; 0 where it does not show.
+
+    on_grid: residual (n,) [m], NaN where nothing is compared;  rate: of the motion (n,) [m/s]
+    """
+    square = rate**2
+    second = np.diff(on_grid, 2)
+    weight = square[:-2] + 4 * square[1:-1] + square[2:]
+    known = np.isfinite(second)
+    second, weight = second[known], weight[known]
+    still = weight < _STILL * np.max(weight, initial=0.0)
+    if np.sum(still) < _LEAST_STILL or _lasts(on_grid, rate):
+        return 0.0
+    at_rest = float(np.mean(second[still] ** 2))
+    total = float(np.sum(weight**2))
+    found = float(np.sum(weight * (second**2 - at_rest))) / total
+    spread = at_rest * np.sqrt(2 * _SHARED / total)
+    return found if found > _CLEARLY * spread else 0.0
+
+
+def _lasts(on_grid: FloatArray, rate: FloatArray) -> bool:
+    """True if neighbours in ``on_grid`` resemble each other where the axis moves."""
+    moving = rate**2 > _STILL * np.max(rate**2)
+    value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
+    product = value[1:] * value[:-1]
+    spread = float(np.sqrt(np.sum(product**2)))
+    return bool(np.sum(product) > _CLEARLY * spread)

@@ -1,0 +1,49 @@
+"""Readings that scatter in time are noisier where the axis moves, and nothing else is wrong."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.fitting.timing_noise import timing_variance
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+
+PERIOD, LAG_S, SCATTER_S = 1e-3, 0.34e-3, 50e-6
+TEST = StepTest()
+TIME = np.arange(0.0, TEST.duration, PERIOD)
+RATE = np.gradient(TEST.positions(TIME).z, PERIOD)
+
+
+def test_the_scatter_is_told_from_noise():
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 10e-9, len(TIME))
+    late = noise + RATE * rng.normal(0, SCATTER_S, len(TIME))
+    late[100] = np.nan
+    assert np.sqrt(timing_variance(late, RATE)) == pytest.approx(SCATTER_S, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_alone_shows_none(seed):
+    noise = np.random.default_rng(seed).normal(0, 10e-9, len(TIME))
+    assert timing_variance(noise, RATE) == 0.0
+
+
+def test_a_lag_that_the_model_misses_is_no_scatter():
+    noise = np.random.default_rng(2).normal(0, 10e-9, len(TIME))
+    assert timing_variance(noise + 50e-6 * RATE, RATE) == 0.0
+    # Nor can it be told where nothing rests.
+    assert timing_variance(noise, np.ones(len(TIME))) == 0.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_probe_that_scatters_is_accepted_and_told_so(seed):
+    rng = np.random.default_rng(seed)
+    z = TEST.positions(TIME).z + rng.normal(0, 0.3e-9, len(TIME))
+    when = TIME - LAG_S + rng.normal(0, SCATTER_S, len(TIME))
+    seen = TEST.positions(when).z + rng.normal(0, 10e-9, len(TIME))
+    certificate = identify(MotionRecord.from_arrays(PERIOD, z, -seen)).calibration.certificate
+    assert str(certificate["verdict"]).startswith("accepted with reservations")
+    assert certificate["timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
+    (told,) = certificate["reservations"]
+    assert "scatter in time by" in told
+    assert certificate["chi_square"] < 1.2
