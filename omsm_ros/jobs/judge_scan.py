@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
-from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.light import Light, Reason, light_of
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, RANDOM, MachineSources
 from omsm_ros.core.correction.scan_fields import resolves_turns, scan_fields
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -84,6 +84,17 @@ class Judgement:
             against_nominal=self.options.surface is not None,
             doubts=tuple(_losses(done)),
         )
+
+
+def live_light(
+    corrector: Corrector,
+    calibration: Calibration,
+    stated: MachineSources,
+    accuracy: float | None,
+) -> Light:
+    """Return the light of what has been corrected so far, by the uncertainty of its points."""
+    shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
+    return light_of(calibration, shared, stated, accuracy=accuracy, against_nominal=False)
 
 
 def _losses(done: Correction) -> Iterator[Reason]:

@@ -8,12 +8,18 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import (
+    NOTHING_STATED,
+    MachineSources,
+    declared_sources,
+)
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.parameters import Parameter
 from omsm_ros.quantities import Quantity
+from omsm_ros.storage.sources_file import load_sources
 
-_AS_CALIBRATED = -1.0
+_AS_CALIBRATED = _NOT_ASKED = -1.0
 _GEOMETRY_OF = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
 _SOURCE_OF: dict[str, Quantity] = {
     "static_gain": quantities.GAIN_UNCERTAINTY,
@@ -51,6 +57,14 @@ PARAMETERS = (
         )
         for field in fields(Geometry)
     ),
+    Parameter(
+        "accuracy",
+        _NOT_ASKED,
+        "asked for, k = 2 [m]: what the light is held against; -1 = the stated uncertainty",
+        quantities.BUDGET,
+        unset=_NOT_ASKED,
+    ),
+    Parameter("sources_file", "", "SOURCES.yaml: what is uncertain of the machine; '' = nothing"),
     *(
         Parameter(
             f"sources.{field.name}",
@@ -74,7 +88,17 @@ def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
     )
 
 
-def sources_of(values: Mapping[str, Any]) -> dict[str, float]:
-    """Return what is stated of the uncertainties; the certificate tells the others."""
-    stated = {f.name: values[f"sources.{f.name}"] for f in fields(ErrorSources)}
-    return {name: value for name, value in stated.items() if value}
+def sources_of(values: Mapping[str, Any]) -> MachineSources:
+    """Return what is uncertain of the machine: by parameters, else by the file."""
+    sizes = {f.name: values[f"sources.{f.name}"] for f in fields(ErrorSources)}
+    by_parameter = declared_sources({name: size for name, size in sizes.items() if size})
+    path = values["sources_file"]
+    by_file = load_sources(path) if path else NOTHING_STATED
+    others = (said for said in by_file.stated if not by_parameter.of(said.source))
+    return MachineSources((*by_parameter.stated, *others))
+
+
+def accuracy_of(values: Mapping[str, Any]) -> float | None:
+    """Return the accuracy asked for, k = 2 [m], None where nobody asked."""
+    asked: float = values["accuracy"]
+    return None if asked == _NOT_ASKED else asked

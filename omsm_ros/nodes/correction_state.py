@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from omsm_ros.core.correction.correct import Corrector
+from omsm_ros.core.correction.light import Light
 from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.core.samples.throughput import LoadMeter
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
@@ -14,6 +15,15 @@ _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
 _BEHIND_MS = 1000.0
 # Reasons that tell of something lost on the way, unlike a probe that looks past its target.
 _LOSSES = ("unmatched", "late", "overdue")
+
+
+def light_values(light: Light) -> dict[str, object]:
+    """Return the light as values of a report: no fault of the node's, so no level of it."""
+    return {
+        "light": light.level,
+        "light_word": light.word,
+        "light_reasons": "; ".join(map(str, light.reasons)),
+    }
 
 
 class CorrectionState:

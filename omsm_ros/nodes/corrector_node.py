@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,14 @@ from sensor_msgs.msg import PointCloud2
 from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
-from omsm_ros.core.correction.uncertainty import sources_with
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.errors import OmsmError
+from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.jobs.predict_motion import predict_from
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
-from omsm_ros.nodes.correction_parameters import PARAMETERS, options_of, sources_of
-from omsm_ros.nodes.correction_state import CorrectionState
+from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
+from omsm_ros.nodes.correction_state import CorrectionState, light_values
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.frames import tell_frames
 from omsm_ros.nodes.managed import ManagedNode
@@ -82,8 +81,9 @@ class CorrectorNode(ManagedNode):
         )
         override = self.values["override"]
         admit(calibration, reasons, override)
-        sources = sources_with(calibration, self._sources)
-        corrector = Corrector(calibration, replace(self._options, sources=sources))
+        corrector = Corrector(
+            calibration, with_sources(self._options, calibration, self._sources, None)
+        )
         # Nothing is refused from here on: the calibration in force is one, wholly.
         self._publish_rest()
         # A viewer that waits for the usual frame shows nothing until somebody has seen why.
@@ -171,6 +171,11 @@ class CorrectorNode(ManagedNode):
         """Return the account, and what is wrong with it now."""
         report = self._state.report(self._corrector, time.monotonic(), time.process_time())
         report.values["calibration"] = self._in_force_id()
+        if self._corrector is not None and self._topic.calibration is not None:
+            light = live_light(
+                self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
+            )
+            report.values |= light_values(light)
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._aside.waiting
         if self._frame != self.values["workpiece_frame"]:

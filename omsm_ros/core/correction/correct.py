@@ -31,7 +31,7 @@ from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import Arrival
 from omsm_ros.core.samples.pairing import Intake, Pairing, Run
 from omsm_ros.errors import CalibrationError, ConfigurationError
@@ -105,7 +105,6 @@ class Corrector:
         self._pairing = Pairing(self._axes.tally, self._distance.tally)
         self._motion: MotionFilter | None = None
         self._noise_gain = 1.0
-        self._hidden: BoolArray = np.zeros(0, np.bool_)
         self._variance: defaultdict[str, float] = defaultdict(float)
         self._ready: list[SurfacePoints] = []
         self._stamp_skew: float | None = None
@@ -211,7 +210,7 @@ class Corrector:
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
         self._noise_gain = max(each.height.noise_gain for each in filters)
-        self._hidden = hidden_rows(filters)
+        self.trace.hidden = hidden_rows(filters)
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)
 
@@ -249,7 +248,7 @@ class Corrector:
     def _of_dynamics(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
         """Variance of H(z) from the noise of the step test, and from what could hide, (n,)."""
         each = points.dynamics**2
-        return np.sum(each[~self._hidden], axis=0), np.sum(each[self._hidden], axis=0)
+        return np.sum(each[~points.hidden], axis=0), np.sum(each[points.hidden], axis=0)
 
     def _uncertainty(self, reading: FloatArray, points: ScanPoints) -> FloatArray:
         variances = contributions(

@@ -10,9 +10,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
-from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.correction.uncertainty import ErrorSources, uncertain_parts
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry
@@ -25,6 +26,7 @@ DISTRIBUTIONS = {"normal": 1.0, "uniform": 1 / math.sqrt(3.0), "arcsine": 1 / ma
 POINT_SOURCES = tuple(field.name for field in fields(ErrorSources))
 # These are uncertain of each point, and of all points together.
 _ALSO_SYSTEMATIC = ("static_gain", "lateral_lag", "motion_error", "pitch")
+_OF_CALIBRATION = ("dynamics", "could_hide")
 RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
 SYSTEMATIC = tuple(KINDS)
 NAMES = (*RANDOM, *SYSTEMATIC)
@@ -34,7 +36,7 @@ NAMES = (*RANDOM, *SYSTEMATIC)
 class StatedSource:
     """What somebody says of one source.
 
-    source: one of ``NAMES`` but "dynamics", which comes from a calibration
+    source: one of ``NAMES`` but those that come from a calibration alone
     value: standard uncertainty; of a uniform distribution its half-width, of an arcsine (a wave
         of unknown phase) its amplitude
     how: EVALUATED from data or DECLARED;  reason: in words;  parameters: of its kind
@@ -48,7 +50,7 @@ class StatedSource:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        allowed = [name for name in NAMES if name != "dynamics"]
+        allowed = [name for name in NAMES if name not in _OF_CALIBRATION]
         if self.source not in allowed:
             raise ConfigurationError(
                 f"uncertainty {shown(self.source)} is unknown, expected of {sorted(allowed)}"
@@ -131,9 +133,11 @@ def whole_scan_sources(
 ) -> tuple[SystematicSource, ...]:
     """Return every source that acts on the whole scan: the calibration's, and what is stated."""
     found = []
-    if calibration.covariance.any():
-        reason = "covariance of the calibration"
-        found.append(source_of("dynamics", 1.0, EVALUATED, reason, {}))
+    members = calibration.members if isinstance(calibration, CalibrationSet) else (calibration,)
+    for name, part in zip(_OF_CALIBRATION, (0, 1), strict=True):
+        if any(uncertain_parts(member)[part].covariance.any() for member in members):
+            reason = "covariance of the calibration"
+            found.append(source_of(name, 1.0, EVALUATED, reason, {}))
     parameters: dict[str, Mapping[str, float]] = {
         "static_gain": {"gain": calibration.static_gain},
         "pitch": {"arm": geometry.abbe_arm},

@@ -10,7 +10,7 @@ import numpy as np
 
 from omsm_ros.core.correction.systematic import ScanPoints
 from omsm_ros.core.machine.kinematics import WorkpiecePoints
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 
 # Sixteen points a turn of the paper's scan and more: enough for what repeats eight times a turn.
@@ -23,6 +23,7 @@ class ScanTrace:
     """Points of a scan, evenly chosen while they pass; time and Z count from the first one.
 
     seen: points that passed
+    hidden: which changes by the covariance are of what the step test could not show, (r,)
     """
 
     def __init__(self, most: int = MOST_TRACED) -> None:
@@ -30,6 +31,7 @@ class ScanTrace:
         self._session: int | None = None
         self._late = self._last = 0.0
         self._first_z = 0.0
+        self.hidden: BoolArray = np.zeros(0, np.bool_)
         self.seen = 0
 
     def add(
@@ -63,6 +65,7 @@ class ScanTrace:
             c=c,
             distance=distance,
             dynamics=motion[2:],
+            hidden=self.hidden,
         )
         self._keep(points)
         return points
@@ -82,4 +85,4 @@ class ScanTrace:
         """Return those kept, in the order of time."""
         rows = self._kept.rows() if self.seen else np.empty((0, len(_COLUMNS)))
         columns = dict(zip(_COLUMNS, rows.T, strict=False))
-        return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :])
+        return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :], hidden=self.hidden)

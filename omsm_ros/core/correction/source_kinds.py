@@ -188,7 +188,15 @@ def _lateral_lag(p: ScanPoints, _: Parameters) -> FloatArray:
 
 
 def _dynamics(p: ScanPoints, _: Parameters) -> FloatArray:
-    return p.dynamics if len(p.dynamics) else np.zeros((1, len(p)))
+    return _rows_or_none(p.dynamics[~p.hidden], p)
+
+
+def _could_hide(p: ScanPoints, _: Parameters) -> FloatArray:
+    return _rows_or_none(p.dynamics[p.hidden], p)
+
+
+def _rows_or_none(rows: FloatArray, p: ScanPoints) -> FloatArray:
+    return rows if len(rows) else np.zeros((1, len(p)))
 
 
 def _linearity(p: ScanPoints, parameters: Parameters) -> FloatArray:
@@ -257,7 +265,8 @@ _CORRELATED = {"correlation_length": quantities.PERIOD}
 _LENGTH_OPTIONAL = ("correlation_length",)
 
 KINDS: dict[str, SourceKind] = {
-    "dynamics": SourceKind("the calibration's covariance", _SHARE, _dynamics),
+    "dynamics": SourceKind("noise of the step test", _SHARE, _dynamics),
+    "could_hide": SourceKind("what the step test could not show", _SHARE, _could_hide),
     "static_gain": SourceKind(
         "static gain of the probe", _SHARE, _static_gain, {"gain": quantities.GAIN}
     ),

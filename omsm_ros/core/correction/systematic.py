@@ -17,7 +17,7 @@ import numpy as np
 
 from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import MICROMETRE_M
 
@@ -37,7 +37,8 @@ class ScanPoints:
     distance: that the probe measured, growing with height [m]
     slope_x, slope_y: of the surface along the workpiece's x and y [1]; None where it is not known
     dynamics: of the heights by each independent direction of the calibration's covariance, per
-        standard uncertainty [m], (r, n)
+        standard uncertainty [m], (r, n);  hidden: which of them are of what its step test could
+        not show (r,)
     """
 
     time: FloatArray
@@ -51,6 +52,7 @@ class ScanPoints:
     slope_x: FloatArray | None = None
     slope_y: FloatArray | None = None
     dynamics: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    hidden: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def __len__(self) -> int:
         return len(self.time)

@@ -88,6 +88,23 @@ def test_noise_at_rest_holds_what_it_is_made_of(true_calibration: Calibration) -
     assert "encoder_noise" in said.not_evaluated
 
 
+def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
+    true_calibration: Calibration,
+) -> None:
+    p = len(true_calibration.covariance)
+    known = replace(true_calibration, covariance=np.diag([1.0] + [0.0] * (p - 1)) * 1e-8)
+    certificate = {**known.certificate, "noise_covariance": [0.0] * p**2}
+    known = replace(known, certificate=certificate)
+    trace = replace(
+        spiral_points(),
+        dynamics=np.stack([spiral_points().x, spiral_points().y]) * 1e-6,
+        hidden=np.array([False, True]),
+    )
+    found = scan_budget(known, NO_ERRORS, {}, Geometry(), NOTHING_STATED, trace, len(trace))
+    assert found.heights == pytest.approx({"could_hide": 1e-6 * np.std(trace.y)})
+    assert "dynamics" in found.not_evaluated
+
+
 def test_several_statements_of_one_source_are_one_row(true_calibration: Calibration) -> None:
     each = [stated("spindle_axial", 3e-9, parameters={"per_turn": k}) for k in (1, 2)]
     found = budget(true_calibration, MachineSources(tuple(each)))
