@@ -53,7 +53,9 @@ def _show_align(facts: Facts) -> None:
     for name, spread in facts["uncertainty"].items():
         value, length = facts["geometry"][name], name.startswith("centre")
         stated = measured(value, spread, "m" if length else "rad")
-        rows.append((name, stated if spread is not None else f"{stated}, not seen in this scan"))
+        rows.append(
+            (name, stated if spread is not None else f"{stated}, not identifiable in this scan")
+        )
     rows.append(("residual", f"{quantity(facts['residual'], 'm')} rms"))
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))

@@ -22,7 +22,7 @@ class Command:
 
     declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
     show: prints the facts for people
-    refusal: why the facts, although told, are not a success; empty if they are one
+    refusal: why the command failed although it returned facts; empty if it did not
     """
 
     name: str
@@ -57,7 +57,7 @@ def kept_at(out: Path, verdict: str) -> Path:
 
 
 def rejected(facts: Facts) -> str:
-    """Why a calibration or model, told by its facts, was rejected; empty if it was not."""
+    """Return why a calibration or model was rejected, by its facts; empty if it was not."""
     if facts["verdict"] != REJECTED:
         return ""
     kept = facts.get("calibration") or facts["model"]

@@ -1,4 +1,4 @@
-"""Takes the command line apart, runs one command, and answers with an exit status."""
+"""Parse the command line, run one command, and return its exit status."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def correct_bag(
         height where the surface slopes
     by_stamps: join the streams by their stamps; None: by the trigger counter they share
 
-    Memory does not grow with the bag, but for ``by_stamps``. Leaves no cloud behind when it fails.
+    Memory does not grow with the bag, but for ``by_stamps``. When it fails, no cloud remains.
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
     """
     scan = CorrectedScan(

@@ -69,7 +69,7 @@ def measure(
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
     register: how the points are registered to ``nominal``; None: they are not
-    report: False leaves out the page, which takes longer than everything else
+    report: False writes no page, which takes longer than everything else
 
     Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
     """

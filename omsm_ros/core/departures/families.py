@@ -1,7 +1,7 @@
 """In which ways may a machine depart from a linear, steady G(s), and how would it look?
 
-Each family gives columns (n, c) of what the probe would see of it, per unit of its size:
-metres for errors of position, participation for what is slow or soft.
+Each family gives columns (n, c) of what it adds to the probe's reading, per unit of its size:
+metres for errors of position, a share of the response for relaxations and modes.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _LINES_TRIED = 3
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One way to depart.
+    """One departure from a linear, steady response.
 
     parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
     trials: how many independent ones its family tries, for the probability of the best
     damping: of a mode, else 0
-    columns: (n, c) of what the probe sees per unit
+    columns: (n, c), added to the reading per unit
     """
 
     family: str
@@ -91,7 +91,7 @@ class Departures:
     steps: Steps
 
     def families(self, only: Collection[str] = ()) -> Iterator[Family]:
-        """Those that this motion could show at all, or of them those named."""
+        """Return the families that this motion could show at all, or those named of them."""
         makers: dict[str, Callable[[], Iterator[Family]]] = {
             CREEP: lambda: iter([self.creep()]),
             MODE: lambda: iter([self.modes()]),
@@ -108,7 +108,7 @@ class Departures:
                 yield from make()
 
     def again(self, term: Term) -> Term:
-        """The ``term`` of another fit as this one has it."""
+        """Return the ``term`` of another fit with the columns that it has in this one."""
         for family in self.families((term.family,)):
             for index in np.flatnonzero(family.parameters == term.parameter):
                 return family.term(int(index))
@@ -129,7 +129,7 @@ class Departures:
         return self.problem.answer(self.fitted)
 
     def time_constants(self) -> FloatArray:
-        """Of relaxations that this record can tell from rest: up to its own length [s]."""
+        """Return the time constants [s] that are looked for, up to the record's length."""
         slowest = max(self.duration, 2 * FASTEST_CREEP_S)
         decades = np.log10(slowest / FASTEST_CREEP_S)
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
@@ -184,7 +184,7 @@ class Departures:
         return Family(VIBRATION, np.asarray(found), samples / 2, columns)
 
     def drift(self) -> Iterator[Family]:
-        """What wanders slowly, whatever the axis does: polynomials of time beyond the first."""
+        """Return polynomials of time beyond the first: slow drift, whatever the axis does."""
         time = np.linspace(-1.0, 1.0, len(self.problem.input))
         columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
         for degree in _DRIFT_DEGREES:
@@ -192,7 +192,7 @@ class Departures:
             yield Family(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
 
     def linearity(self) -> Family:
-        """Square and cube of the place of the axis in its travel: a probe that is not linear."""
+        """Return square and cube of the position in the travel: a probe that is not linear."""
         place = self._place
         columns = np.column_stack([place**2, place**3])
         return Family(LINEARITY, np.zeros(1), 1.0, columns)
@@ -204,7 +204,7 @@ class Departures:
         return np.asarray((motion - middle) / (0.5 * np.ptp(motion) or 1.0))
 
     def stiffening(self) -> Family:
-        """Cube of the deflection, the motion seen less the motion made, per its largest."""
+        """Return the cube of the deflection (output less input), over its largest value."""
         answer = self._in_time(self._answer)
         deflection = answer / self.fitted.gain - self.problem.input
         deflection = deflection - np.median(deflection)
@@ -212,7 +212,7 @@ class Departures:
         return Family(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
 
     def periodic(self) -> Family:
-        """Sines of the place of the axis, from the whole travel to a fraction of it."""
+        """Return sines of the position, with periods from the whole travel to a fraction of it."""
         answer = self._in_time(self._answer) / self.fitted.gain
         travel = float(np.ptp(answer)) or 1.0
         cycles = np.arange(3, _MOST_CYCLES, dtype=np.float64)
@@ -234,17 +234,16 @@ class Departures:
 
     @cached_property
     def _turning(self) -> FloatArray:
-        """Where the structure stands that drags or has a gap, with its true reversals.
+        """Return the position of the structure, ``_FINER`` values a sample.
 
-        A motion turns between samples, and what a gap remembers is how far it came:
-        ``_FINER`` values a sample.
+        A motion reverses between samples, and backlash depends on how far it went.
         """
         length = _FINER * self.problem.closed_length
         answer = _FINER * fft.irfft(self._answer / self.fitted.gain, length)
         return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
 
     def backlash(self) -> Iterator[Family]:
-        """Half of the backlash: against the last reversal, and against the last step."""
+        """Return half of the backlash: by the last reversal, and by the last step."""
         if self.steps.edges:
             lost = [c[::_FINER] for gap in _GAPS_M for c in lost_in_gap(self._turning, gap)]
             gain = self.fitted.gain

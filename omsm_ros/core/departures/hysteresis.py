@@ -1,7 +1,7 @@
 """What depends on where a motion turned last: backlash (a gap), and friction before it slides.
 
-Both know reversals only, not time. A reversal is told from noise by a gap of a few times the
-noise, which the motion has to cross; so they hold still where the axis rests.
+Both depend on reversals only, not on time. A reversal counts once the motion has gone back by a
+few times its noise; so noise at rest changes nothing.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ _NOISE_HALF_GAP = 2.0
 
 
 def without_noise(motion: FloatArray, noise: float) -> FloatArray:
-    """``motion`` (n,) [m] with those reversals only that ``noise`` [m], its deviation, is not."""
+    """Return ``motion`` (n,) [m] without the reversals of ``noise`` [m], its deviation."""
     return through_gap(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
 
 
 def through_gap(motion: FloatArray, half: float) -> FloatArray:
-    """What ``motion`` (n,) drives through a gap of ±``half`` [m], in its middle at first."""
+    """Return the output (n,) of a gap of ±``half`` [m] that ``motion`` (n,) drives."""
     change = np.diff(motion, prepend=motion[0])
     moved = np.flatnonzero(change)
     if len(moved) == 0:
@@ -36,7 +36,7 @@ def through_gap(motion: FloatArray, half: float) -> FloatArray:
 
 
 def lost_in_gap(motion: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Share -1 to 1 of half the ``gap`` [m] that ``motion`` (n,) is ahead, and its unknown start.
+    """Return the lead of ``motion`` (n,) over half the ``gap`` [m], -1 to 1, and a start column.
 
     Until the whole gap is crossed, what is ahead depends on where in it the motion began.
     """
@@ -46,7 +46,7 @@ def lost_in_gap(motion: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]
 
 
 def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
-    """Friction force between -1 and 1 along ``motion`` (n,), and what is left of its start.
+    """Return the friction force along ``motion`` (n,), -1 to 1, and the decay of its start value.
 
     dF/dx = (1 - F sgn v) / travel (Dahl 1968).
     """

@@ -1,9 +1,8 @@
-"""How much of a residual would one more term explain, and how large a term would it not show?
+"""How much of a residual would one more term explain, and how large a term would stay hidden?
 
-A score test (Rao 1948): the term's column is freed of everything that the fitted parameters
-could imitate, and the residual is projected on what is left. The variance is that of the
-residual's own spectrum *without* the term, so that a term does not hide behind the noise
-that it makes itself.
+A score test (Rao 1948): the part of the term's column that the fitted parameters can imitate is
+taken out, and the residual is projected on the rest. Its variance is that of the spectrum of the
+residual *without* the term, because a large term would otherwise count as noise.
 """
 
 from __future__ import annotations
@@ -35,7 +34,8 @@ class Score:
     """What the residual says of one term.
 
     size: its coefficients (c,), and covariance (c, c) of them
-    chi_square: that they are zero;  degrees: how many could be told from the fit
+    chi_square: of the hypothesis that they are zero;  degrees: coefficients that the fit does
+        not imitate
     """
 
     size: FloatArray
@@ -45,12 +45,12 @@ class Score:
 
     @property
     def log_p(self) -> float:
-        """Natural logarithm of the probability of ``chi_square`` if the term is absent."""
+        """Return ln of the probability of ``chi_square`` or more if the term is absent."""
         return float(stats.chi2.logsf(self.chi_square, self.degrees)) if self.degrees else 0.0
 
     @property
     def uncertainty(self) -> float:
-        """Standard uncertainty of the first coefficient; infinite where nothing tells it."""
+        """Return the standard uncertainty of the first coefficient, infinite if unknown."""
         return float(np.sqrt(self.covariance[0, 0]))
 
 
@@ -66,7 +66,7 @@ class ResidualSpace:
         return orthonormal(self.problem.sensitivity(self.fitted), _SPANNED)
 
     def freed(self, columns: FloatArray) -> FloatArray:
-        """``columns`` (n, c) where compared, less what the fit imitates of them, (k, c)."""
+        """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
         compared = columns[self.problem.used]
         return np.asarray(compared - self._basis @ (self._basis.T @ compared))
 
@@ -128,11 +128,11 @@ class ResidualSpace:
 
 
 def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
-    """Variance spectrum of ``left`` (k,) at ``length`` // 2 + 1 frequencies; white is flat.
+    """Return the variance spectrum of a residual ``left`` (k,) at ``length`` // 2 + 1 frequencies.
 
     place: index of each among ``samples``
-    The larger of an autoregressive one, which knows no slow wander, and of the periodogram
-    smoothed over an octave, which does.
+    The larger of an autoregressive one, which misses slow drift, and of the periodogram
+    smoothed over an octave, which does not.
     """
     on_grid = np.zeros(samples)
     on_grid[place] = left

@@ -33,12 +33,12 @@ class Judged:
         return self.score.log_p + float(np.log(self.term.trials))
 
     def evidence(self, samples: int) -> float:
-        """Logarithm of the odds for this term (Schwarz 1978): each coefficient has its price."""
+        """Return ln of the odds for this term (Schwarz 1978), its coefficients priced."""
         return 0.5 * (self.score.chi_square - self.score.degrees * float(np.log(samples)))
 
     @property
     def significant(self) -> bool:
-        """Too much to be chance."""
+        """Return whether chance is less likely than FALSE_ALARM."""
         return bool(self.log_p < np.log(FALSE_ALARM))
 
 
@@ -63,7 +63,7 @@ class Survey:
 
     @cached_property
     def best(self) -> Mapping[str, Judged]:
-        """The term of each family that the residual shows most, by the name of the family."""
+        """Return the most significant term of each family, by the name of the family."""
         found: dict[str, Judged] = {}
         for family in self.departures.families(self.only):
             screened = self.space.screen(family.columns, family.width)
@@ -75,14 +75,14 @@ class Survey:
 
     @cached_property
     def creep(self) -> tuple[Judged, ...]:
-        """Relaxations of every time constant that the record can tell from rest, each alone."""
+        """Return relaxations of every time constant that is looked for, each judged alone."""
         family = self.departures.creep()
         terms = [family.term(index) for index in range(len(family.parameters))]
         return tuple(Judged(t, self.space.score(t.columns[:, :1])) for t in terms)
 
     @cached_property
     def independence(self) -> float:
-        """Probability by chance that the residual follows the rate of the motion as it does."""
+        """Return the probability that the residual follows the motion's rate by chance."""
         rate = np.gradient(self.problem.input)
         past = np.column_stack([np.roll(rate, lag) for lag in range(_LAGS)])
         past[:_LAGS] = 0.0
@@ -91,7 +91,7 @@ class Survey:
         return float(np.exp(self.space.score(left[:, told]).log_p)) if np.any(told) else 1.0
 
     def significant(self, but: Collection[str] = ()) -> list[Judged]:
-        """Families that show beyond chance, the clearest first, without those named ``but``."""
+        """Return the significant families, the clearest first, without those named ``but``."""
         shown = [j for j in self.best.values() if j.term.family not in but and j.significant]
         return sorted(shown, key=self.evidence, reverse=True)
 
@@ -101,7 +101,7 @@ class Survey:
 
     @property
     def slowest_creep(self) -> float:
-        """Longest time constant [s] that was looked for."""
+        """Return the longest time constant [s] that was looked for."""
         return float(self.departures.time_constants()[-1])
 
     @property

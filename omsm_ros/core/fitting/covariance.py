@@ -19,7 +19,7 @@ _RANK_TOLERANCE = 1e-11
 def autoregression(
     residual: FloatArray, highest: int = _MAX_NOISE_ORDER
 ) -> tuple[FloatArray, float]:
-    """Whitening filter [1, a1 …] of a residual (n,) and the variance it leaves.
+    """Return the whitening filter [1, a1 …] of a residual (n,) and the variance of its output.
 
     By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
     """
@@ -44,7 +44,7 @@ def autoregression(
 
 
 def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
-    """Variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies; white is flat."""
+    """Return the variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies."""
     coefficients, variance = autoregression(residual)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
 
@@ -55,13 +55,13 @@ def parameter_covariance(
     residual: FloatArray,
     passed: TransferFunction | None = None,
 ) -> FloatArray:
-    """(q, q) covariance of the parameters of ``columns`` (k, q), coloured residual allowed.
+    """Return the covariance (q, q) of the parameters of ``columns`` (k, q) in coloured noise.
 
     The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
 
-    passed: through which the noise of the motion comes into the residual, None if it does not.
-        A sharp resonance lifts it out of the probe's noise just where it is identified, in a
-        line too narrow for the residual to show.
+    passed: fit whose response brings the encoder's noise into the residual; None if none is
+        to be added. A sharp resonance amplifies that noise at its own frequency, in a line too
+        narrow for the residual to show.
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))
@@ -93,7 +93,7 @@ def parameter_covariance(
 
 
 def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
-    """Standard uncertainty of the gain, relative, if nothing is known of lag and curvature."""
+    """Return the relative standard uncertainty of the gain with lag and curvature fitted too."""
     every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
     return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
 
@@ -109,7 +109,7 @@ def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: i
 def hidden_motion_covariance(
     dynamics: TransferFunction, delay_bound: float, sample_period: float
 ) -> FloatArray:
-    """Covariance (p, p) of the coefficients due to motion hidden between samples.
+    """Return the covariance (p, p) of the coefficients due to motion hidden between samples.
 
     Folded motion shifts the lag by up to ``delay_bound`` [s], and bends the response by a
     term in s² as the folded content varies over a tenth of the sampling rate around it.

@@ -1,7 +1,8 @@
 """Where the fit of a sampled model starts: poles by ARX, instrumental variables, and subspace.
 
-Each finds what the others miss: least squares of an ARX model a well-damped response in little
-noise, instruments the same in coloured noise, a subspace the modes of a high order at once.
+Each finds what the others miss. Least squares of an ARX model finds a well-damped response in
+little noise; instrumental variables find it in coloured noise too; a subspace method finds all
+modes of a high order at once.
 """
 
 from __future__ import annotations

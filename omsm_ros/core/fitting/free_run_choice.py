@@ -1,9 +1,9 @@
-"""Which sampled model predicts best what it has not seen? Judged by free runs.
+"""Which sampled model predicts best the parts of a record that were hidden from its fit?
 
 Orders are fitted to the first part of the record and run freely over the rest. The few that
 predict it best are then judged on several hidden parts, as they are and with their residual
-whitened, which is efficient only for a model that holds all the dynamics. Of those that
-predict equally well the plainest is taken: poles to spare would follow a drift.
+whitened, which is efficient only for a model that has all the dynamics. Of those that
+predict equally well the simplest is taken: superfluous poles would follow a drift.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class SampledChoice:
 
 
 def parameters(order: int) -> int:
-    """Number of parameters: denominator, numerator, initial state and offset."""
+    """Return the number of parameters: denominator, numerator, initial state and offset."""
     return 3 * order + 3
 
 
@@ -219,8 +219,8 @@ def _next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteSt
 def _grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
     """Starts for one pole more than the last of ``smaller``.
 
-    A pole too fast to be seen, so that richer never fits worse; and two as slow as the record
-    is long: from afar, a pair of integrators is behind a crest of the error.
+    A pole too fast to matter, so that a larger model never fits worse; and two as slow as the
+    record is long: descent alone does not reach a pair of integrators from other starts.
     """
     slow = np.log(samples / 2)
     fast = [_with_pole(smaller[-1], _FAST)]
@@ -273,8 +273,8 @@ def _finalists(by_order: FloatArray, order: int) -> list[int]:
 def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
     """Mean square error over each hidden part, the candidate fitted without it.
 
-    A model is asked to bridge a part and to run on beyond the data; either alone misjudges:
-    a plant that drifts is held at both ends of a bridge. None is asked to run backwards.
+    Some parts lie inside the record and one at its end. Inside alone would misjudge a plant that
+    drifts, because the data hold the model at both ends. No model has to run backwards.
     """
     problem, number = candidate.problem, np.floor(part)
     hidden = [number == i for i in range(1, _PARTS)]
@@ -288,7 +288,7 @@ def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
 
 
 def _plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
-    """Of those that no other beats, the plainest: not whitened, then with fewest poles.
+    """Return the simplest of those that no other beats: not whitened, then with fewest poles.
 
     One beats another that is better in the mean by more than one standard error of their
     difference (Breiman et al. 1984, paired).

@@ -103,9 +103,9 @@ class HeldProblem(Problem):
         return DiscreteScaled(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """The input, and a pulse at the first sample whose terms make any initial state.
+        """Return the input, and a pulse at the first sample whose terms make any initial state.
 
-        n of them do from the second sample on, and one more sets the first free.
+        n terms do so from the second sample on; one more frees the first sample.
         """
         pulse = np.ones(len(self.s), np.complex128)
         return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles + 1)]
@@ -117,7 +117,7 @@ class HeldProblem(Problem):
         return spectra
 
     def columns(self, fitted: Fit) -> FloatArray:
-        """d output / d(terms of the numerator, ψ, initial state, background), shape (k, …)."""
+        """Return d output / d(terms of the numerator, ψ, initial state, background), (k, …)."""
         lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
         terms = fitted.structure.zeros + 1
@@ -126,7 +126,7 @@ class HeldProblem(Problem):
         return np.column_stack([self._in_time(every).T, self._fixed])
 
     def free_run(self, fitted: Fit) -> FloatArray:
-        """Output (n,) of the dynamics of ``fitted``, initial state and offset found anew."""
+        """Return the output (n,) of ``fitted`` with initial state and offset fitted anew."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         spectra = self._driven(fitted.structure, lag)
         terms = fitted.structure.zeros + 1
@@ -137,7 +137,7 @@ class HeldProblem(Problem):
         return np.asarray(moved + free @ state)
 
     def residual(self, fitted: Fit) -> FloatArray:
-        """Output less a free run, where it is used, (k,)."""
+        """Return the output less a free run, where it is used, (k,)."""
         return np.asarray((self.output - self.free_run(fitted))[self.used])
 
 

@@ -1,8 +1,8 @@
-"""Did the record start while something still rang? Free decays of the model's own poles.
+"""Does the record start while the machine still rings from an earlier motion?
 
-What moved before the first sample is unknown, but all that is left of it is a sum of decays
-at the poles of G. Fast ones are over before the first sample that counts; a light mode may
-ring on for a second, and a fit that takes it for an answer to the motion is biased.
+The motion before the first sample is unknown, but its response since then is a sum of decays at
+the poles of G. Fast ones are over before the first sample that counts. A lightly damped mode may
+ring for a second, and a fit that takes its ringing for a response to the motion is biased.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _SPANNED = 1e-6
 def starts_ringing(
     problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
 ) -> bool:
-    """True if free decays of the poles of ``fitted`` reach into the samples that count.
+    """Return whether decays at the poles of ``fitted`` reach into the samples that count.
 
-    at_rest: the axis is, at the start; then they have to show clearly in the residual
-    colour: power of the noise at low frequency over its mean, by which chance explains more
+    at_rest: the axis rests at the start; then the decays have to show clearly in the residual
+    colour: power of the noise at low frequency over its mean, see ``information``
     """
     counted = np.flatnonzero(problem.used)
     if problem.fits_initial_condition or fitted.structure.poles == 0 or len(counted) == 0:

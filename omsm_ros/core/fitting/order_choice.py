@@ -1,9 +1,9 @@
-"""How many poles, zeros, and whether a delay: what the data insist on, and one more.
+"""How many poles and zeros, and is there a delay? What the data ask for, and one parameter more.
 
-The Bayesian information criterion finds the smallest structure the data insist on. That still
-leaves a bias of about one standard deviation, which no covariance shows. The chosen one is
-therefore the best with one parameter more: variance, which the band states, is preferred to
-bias, which nobody sees. What else was tried, and changed nothing, is in
+The Bayesian information criterion finds the smallest structure that the data ask for. It is still
+biased by about one standard deviation, which no covariance shows. The chosen structure is
+therefore the best with one parameter more: it trades that bias for variance, which the band
+states. What else was tried, and changed nothing, is in
 ``docs/design/identification-ablation.md``.
 """
 
@@ -31,9 +31,9 @@ _CANCELLING = 0.005
 
 
 def structures(poles: int) -> list[Structure]:
-    """Those with ``poles``, smallest first: one or two zeros fewer, with a delay or without.
+    """Return those with ``poles``, smallest first: one or two zeros fewer, with a delay or without.
 
-    What has mass does not follow infinitely fast, so there are always fewer zeros than poles.
+    A mass cannot follow infinitely fast, so there are always fewer zeros than poles.
     """
     if poles == 0:
         return [Structure(0, 0, True)]
@@ -51,10 +51,10 @@ class Candidate:
 
 
 def information(fit: Fit, colour: float = 1.0) -> float:
-    """Bayesian information criterion, -2 log likelihood + colour · size · log n.
+    """Return the Bayesian information criterion, -2 log likelihood + colour · size · log n.
 
-    colour: power of the noise at low frequency over its mean. Of coloured noise a slow
-        parameter explains that much more by chance, and has to explain it to be believed.
+    colour: power of the noise at low frequency over its mean. A parameter of slow dynamics
+        explains that much more of coloured noise by chance, so its price is that much higher.
     """
     n = fit.samples
     floor = float(np.finfo(np.float64).tiny)
@@ -66,7 +66,7 @@ def explore(
     order: int = 0,
     colour: float = 1.0,
 ) -> list[Candidate]:
-    """Fit structure after structure; stop when two more poles in a row gain nothing.
+    """Fit structures of rising order until two more poles in a row gain nothing.
 
     order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
 
@@ -109,10 +109,10 @@ def _promising(
 
 
 def choose(candidates: Sequence[Candidate]) -> Candidate:
-    """Return the best by BIC, enriched: the best that contains it with one parameter more.
+    """Return the best structure that contains the best by BIC and has one parameter more.
 
-    With fewer than three parameters, lag and roll-off could not both bend over the band.
-    One whose zero cancels a pole is no richer.
+    It has three parameters at least: with fewer, lag and roll-off are not independent. A
+    structure whose zero cancels a pole does not count as larger.
     """
     smallest = min(candidates, key=lambda c: c.bic)
     wanted = max(smallest.fit.structure.size + 1, _LEAST_PARAMETERS)
@@ -127,14 +127,14 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def cancels(dynamics: TransferFunction) -> bool:
-    """True if a zero all but cancels a pole, which then means nothing and has no covariance."""
+    """Return whether a zero nearly cancels a pole: neither then has a meaningful covariance."""
     poles, zeros = dynamics.poles(), dynamics.zeros()
     apart = np.abs(poles[:, np.newaxis] - zeros[np.newaxis])
     return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
 
 
 def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
-    """rms [m] over the samples ``held`` (n,) of the structure fitted without them; NaN if none."""
+    """Return the rms residual [m] over ``held`` (n,), fitted without them; NaN for none."""
     rest, unseen = problem.used & ~held, problem.used & held
     if not (np.any(rest) and np.any(unseen)):
         return float("nan")

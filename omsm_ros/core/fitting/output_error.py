@@ -1,4 +1,4 @@
-"""Fit G(s) to a motion and what the probe saw of it, by the error of the output.
+"""Fit G(s) to an input and an output by the error of the output.
 
 The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
 ``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is
@@ -38,12 +38,12 @@ _PULSE_END = 14.0
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is fitted: ``seen`` (n,) where ``used`` (n,), from ``motion`` (n,), plus ``background``.
+    """What is fitted: ``output`` (n,) where ``used`` (n,), by ``input`` (n,) and ``background``.
 
-    background: (n, q) columns that the probe may see whatever the axis does (offset, drift …)
+    background: (n, q) columns of what adds to the output whatever the axis does (offset, drift …)
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
-    fits_initial_condition: fit also free decays, of what moved before the first sample
+    fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
     """
@@ -87,7 +87,7 @@ class Problem:
         return Scaled(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """What drives the system: spectra (k,), each with its number of numerator terms."""
+        """Return what drives the system: spectra (k,), each with its number of numerator terms."""
         motion = (self._spectrum, structure.zeros + 1)
         return [motion, (self._pulse, structure.poles)] if self.fits_initial_condition else [motion]
 
@@ -103,7 +103,7 @@ class Problem:
         return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
 
     def initial_condition_response(self, fitted: Fit) -> FloatArray:
-        """Free decays of the poles of ``fitted`` from before the first sample, (n, poles)."""
+        """Return the decays (n, poles) at the poles of ``fitted`` from before the first sample."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
         spectra = powers * (lag * self._pulse)
@@ -269,7 +269,10 @@ class _Cache:
 
 
 def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
-    """The best local minimum from ``starts``, each a ψ; all race, the best of them finishes."""
+    """Return the best local minimum found from ``starts``, each a ψ.
+
+    Each start gets a few evaluations; the best of them then runs to its minimum.
+    """
     scaled = problem.parametrised(structure)
     cache = _Cache(problem, scaled)
     best, best_cost = starts[0], np.inf

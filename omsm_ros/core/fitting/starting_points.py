@@ -1,7 +1,7 @@
 """Where a fit starts: several places, because the output error has local minima.
 
-From the best fit of a smaller structure, so that richer never fits worse; from iterated linear
-least squares, which finds a resonance that no guess would; and from a plain guess.
+From the best fit of a smaller structure, so that a larger one never fits worse; from iterated
+linear least squares, which finds a resonance that no guess would; and from a simple guess.
 """
 
 from __future__ import annotations

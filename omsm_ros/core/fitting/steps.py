@@ -54,10 +54,10 @@ class Steps:
 
 
 def sample_noise(values: FloatArray) -> float:
-    """Standard deviation of white noise on a smooth signal, from its differences.
+    """Return the standard deviation of white noise on a smooth signal, from its differences.
 
-    Motion makes any of them too large, the lowest most; the smallest is the noise. A median,
-    so that the few samples at the edges do not count.
+    Motion adds to the differences of each order, to the lowest most, so the smallest estimate is
+    taken. Each is a median, to which the few samples at edges do not matter.
     """
     orders = [order for order in _DIFFERENCES if order < len(values)]
     return min((_difference_noise(values, order) for order in orders), default=0.0)
@@ -121,7 +121,7 @@ def _edges(z: FloatArray, moving: BoolArray) -> tuple[Edge, ...]:
 
 
 def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]]:
-    """The record cut midway between edges, one edge a piece.
+    """Return the record cut midway between edges, one edge a piece.
 
     With fewer than ``least`` edges it is cut into twice as many equal parts instead.
     """
@@ -134,7 +134,7 @@ def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]
 
 
 def held_out(steps: Steps, samples: int) -> BoolArray:
-    """True in every third edge's segment, so that both directions are held out, shape (n,)."""
+    """Return True in the segment of every third edge, (n,): both directions are held out."""
     mask = np.zeros(samples, np.bool_)
     for start, stop in segments(steps, samples)[1::3]:
         mask[start:stop] = True
@@ -142,9 +142,9 @@ def held_out(steps: Steps, samples: int) -> BoolArray:
 
 
 def backlash_columns(steps: Steps, samples: int) -> FloatArray:
-    """Direction of the last move (n, 1 or 2), and a mark of the time before the first.
+    """Return the direction of the last move, and a mark of the time before the first, (n, 1 or 2).
 
-    A play of b shifts what the probe sees by ±b/2 with the direction of approach.
+    A backlash of b shifts the output by ±b/2 with the direction of approach.
     """
     if not steps.edges:
         return np.empty((samples, 0))

@@ -1,8 +1,8 @@
 """What makes the response less certain than the noise of the probe does?
 
-A term states what the data cannot show: it adds to the covariance of the coefficients, and
-its finding stands in the certificate. To add one, write a function of the same signature
-as :func:`hidden_motion` and append it to :data:`COVARIANCE_TERMS`.
+A term is a source of error that the data cannot show. It adds to the covariance of the
+coefficients, and its finding stands in the certificate. To add one, write a function of the same
+signature as :func:`hidden_motion` and append it to :data:`COVARIANCE_TERMS`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def hidden_motion_finding(bound: float, delay_noise: float) -> Finding:
 def reference_delay(record: MotionRecord, fit: Fit) -> CovarianceTerm:
     """Return the term of the lag of the reference sensor, where it was the input.
 
-    A correction filters the encoder, so what the reference is late would be missing in it.
+    A correction filters the encoder, so the lag of the reference would be missing from it.
     """
     size = len(fit.dynamics.numerator) + len(fit.dynamics.denominator)
     covariance, lag = np.zeros((size, size)), reference_lag(record)

@@ -1,7 +1,7 @@
-"""What departs from a linear, steady response, in plain words, and what can be done at the machine.
+"""Say which departures from a linear, steady response were found, and what to do at the machine.
 
-What was modelled is a reservation: its uncertainty is in the band and in the budget. What
-shows and cannot be modelled rejects, with its cause.
+A departure that was modelled is a reservation: its uncertainty is in the band and in the budget.
+One that is significant and could not be modelled rejects the calibration, with its cause.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _REMEDY = {
 
 
 def departures(searched: Searched) -> Finding:
-    """Return what was found beside the response, what in it, and what could not be modelled."""
+    """Report the departures that were modelled, and those that could not be."""
     fit, problem = searched.model.chosen.fit, searched.prepared.problem
     beside = _sizes(problem, fit, searched.beside)
     costs = [

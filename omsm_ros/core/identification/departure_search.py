@@ -1,8 +1,9 @@
-"""Model what the residual shows, one departure after the other, while it shows any.
+"""Model departures one after the other, as long as the residual shows a significant one.
 
 A slow relaxation or a soft mode becomes a pole; what adds to the reading whatever G is
-(backlash, friction, drift, a line of vibration …) becomes columns beside it. What two slow
-families explain about equally well is fitted together, so that neither takes the other's part.
+(backlash, friction, drift, a line of vibration …) becomes columns beside it. Two slow families
+that explain the residual about equally well are fitted together: alone, one would take the
+other's part.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Searched:
     """What was fitted in the end.
 
     beside: departures in the background;  in_response: those that became poles
-    unmodelled: shown by the residual, and not to be had;  survey: of the last fit
+    unmodelled: significant, but no model describes them;  survey: of the last fit
     """
 
     prepared: Prepared

@@ -1,13 +1,12 @@
 """What could hide in this very test, and how much would it cost on a scan?
 
-A term that the residual does not show may still be there, up to a size at which it would
-have been seen. Leaving it out shifts the fitted coefficients by what they imitate of it.
-Its size is known as N(estimate, uncertainty²), so the mean square of what is left out is
-estimate² + uncertainty²: that much is added to the covariance, unless the user declares
-a smaller prior.
+A term that is not significant may still be there, up to the size at which it would have been
+significant. The fitted coefficients then imitate a part of it, which shifts them. Its size is known
+as N(estimate, uncertainty²), so its mean square is estimate² + uncertainty²: the shift of that
+size is added to the covariance, unless the user declares a smaller prior.
 
-Of a slow relaxation G(0) = 1 alone knows: everything faster is off by its size ε. That is
-a variance of the whole numerator; only slower than ``valid_from`` is the gain one again.
+A slow relaxation of size ε leaves G(0) = 1 and scales everything faster by 1 - ε. That is a
+variance of the whole numerator; below ``valid_from`` the gain is one again.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ _UNSEEN = _DECADES / 3**0.5
 class HiddenTerm:
     """One family that could hide.
 
-    size, uncertainty: of the term that the residual shows most, in its unit
+    size, uncertainty: of the most significant term of the family, in its unit
     missed: largest size that the test would have missed with 5 % probability
     shift: (p,) of the coefficients per unit, if the term is left out
     gain: (p,) change of the coefficients that scales the whole response by one
@@ -95,7 +94,7 @@ def hidden_terms(survey: Survey) -> list[HiddenTerm]:
 
 
 def _worst(relaxations: list[HiddenTerm], found: float) -> HiddenTerm:
-    """The relaxation that would cost most, where some is found no larger than likely.
+    """Return the relaxation that would cost most, no larger than is likely where one was found.
 
     found: size of what is in the model already. Creep of joints and of piezos goes about
     evenly with the logarithm of time; what lies in the other decades of the record is not

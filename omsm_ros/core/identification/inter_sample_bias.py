@@ -1,8 +1,8 @@
-"""What an edge may hide between samples, as a bound on the lag.
+"""Bound the bias of the lag from motion that an edge hides between samples.
 
-Motion beyond half the sampling rate folds into the samples, and edges locked to the
-sample clock fold alike every time: the fit then sees a lag that is not there, with white
-residuals. The data cannot show it, but the encoder's content near half the rate bounds it.
+Motion beyond half the sampling rate folds into the samples. Edges locked to the sample clock fold
+alike every time: the fit then finds a lag that is not there, with white residuals. The data
+cannot show it, but the encoder's content near half the sampling rate bounds it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _MARGIN_SAMPLES = 20
 
 
 def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: float) -> float:
-    """Bound on the bias of the low-frequency delay [s] from motion hidden between samples.
+    """Return a bound on the bias of the low-frequency delay [s] by motion hidden between samples.
 
     With U the spectrum of an edge of height A, what folds onto low frequencies is U at the
     sampling rate on both sides, so the lag shifts by up to ``2 |U(f_s)| (1 + |G|) / A``.

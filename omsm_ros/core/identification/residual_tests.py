@@ -1,8 +1,8 @@
-"""Does a fitted model leave anything unexplained? Tests on its residual, and a second method.
+"""Is the residual of a fit only noise? Tests of it, and a second method.
 
-The tests of Ljung (1999, ch. 16): a white residual says that the noise is understood, a
-residual independent of the motion says that the dynamics are. The second matters more;
-the covariance allows for coloured noise, but for a missing mode nothing can.
+The tests of Ljung (1999, ch. 16). A white residual says that the model of the noise is right, one
+that is independent of the motion says that the dynamics are. The second matters more: the
+covariance allows for coloured noise, but nothing allows for a missing mode.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
 
 
 def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
-    """Power of the noise at low frequency over its mean where the axis rests; 1 for white."""
+    """Return the power of the noise at rest at low frequency, over its mean; 1 for white noise."""
     on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
     # Readings that hardly change at rest do not tell it either.
@@ -98,7 +98,7 @@ def _noise_of_neighbours(values: FloatArray) -> float:
 
 
 def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
-    """p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
+    """Return the p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
     n = len(residual)
     correlation = _correlation(residual, residual, lags)[1:]
     statistic = n * (n + 2) * np.sum(correlation**2 / (n - np.arange(1, lags + 1)))

@@ -49,7 +49,7 @@ def sampled_certificate(
     order, free_order: number of poles of the model, and of the free choice
     widened: factor on its uncertainties, for an order that was asked for
     valid: range [Hz] within ``limits``
-    entries: with "predicted", the part of the variance of hidden parts that free runs account for
+    entries: with "predicted", the share of the variance of the hidden parts that free runs explain
     """
     predicted = entries["predicted"]
     assert isinstance(predicted, float)

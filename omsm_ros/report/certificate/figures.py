@@ -1,4 +1,4 @@
-"""Figures of a certificate: the response with its band, what the model leaves, the order.
+"""Figures of a certificate: the response with its band, the residual, the order.
 
 Every function returns a matplotlib Figure that belongs to the caller; all arguments are SI.
 """
@@ -93,7 +93,7 @@ def thinned(seen: FrequencyResponse) -> FrequencyResponse:
 
 
 def residual(fitted: FittedRecord, noise: float | None) -> Figure:
-    """What the model leaves: over the recording, at the mean edge, and its correlation.
+    """Draw the residual: over the recording, at the mean edge, and its correlation.
 
     noise: standard deviation of a reading [m], for comparison, or None
     """
@@ -152,7 +152,7 @@ def draw_correlation(axes: Axes, left: FloatArray) -> None:
 
 
 def order(candidates: Sequence[Mapping[str, float]], chosen: int | None) -> Figure:
-    """What each candidate leaves, over its number of parameters.
+    """Draw the residual of each candidate over its number of parameters.
 
     candidates: ``parameters``, ``rms_m`` and ``bic`` of each;  chosen: index of one of them
     """

@@ -64,7 +64,7 @@ def response_of(model: SampledModel, frequency: FloatArray) -> tuple[ComplexArra
 
 
 def record(model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun) -> Figure:
-    """Input, output beside the free run, and what the run leaves, over time."""
+    """Draw input, output beside the free run, and their difference over time."""
     made, axes = style.figure(7.4, 6.2, rows=3, sharex=True)
     given, both, left = axes[:, 0]
     time = model.sample_period * np.arange(len(input))

@@ -44,7 +44,7 @@ _CLOSING = (
 
 @dataclass(frozen=True, slots=True)
 class CertificatePage:
-    """Everything on the page; what is absent leaves no hole.
+    """Everything on the page; what is absent is left out.
 
     date: of issue, as it is to be printed
     source: the recording that it was identified from, for a reader
@@ -175,7 +175,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
     )
     spread = number(certificate.get("static_gain_uncertainty"))
     return [
-        Headline("Low-frequency delay", delay, _k1(delay, "how late slow motion is seen")),
+        Headline("Low-frequency delay", delay, _k1(delay, "by which the probe lags slow motion")),
         Headline("Of it latency", latency_text(calibration), "by which X and C are delayed"),
         _gain_headline(calibration.static_gain, spread),
         _range_headline(calibration),
@@ -212,7 +212,7 @@ def _range_headline(calibration: Calibration) -> Headline:
         name, details = "Valid up to", [f"half the sampling rate is {quantity(nyquist, 'Hz')}"]
         if shown is not None and calibration.valid_up_to < nyquist:
             told = calibration.valid_up_to < shown
-            ends = "the band leaves its limits" if told else "the motion tells too little"
+            ends = "the band exceeds its limits" if told else "the motion excites too little"
             details.insert(0, f"beyond it {ends}")
     return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
 
@@ -229,7 +229,7 @@ def _departures(entries: tables.CertificateEntries) -> Section:
         (),
         (tables.departure_table(entries), tables.hidden_table(entries)),
         "A size that would be missed is one that this very test shows with a probability of "
-        "95 %; the band holds what the test leaves open of it.",
+        "95 %; the band includes what the test cannot exclude.",
     )
 
 

@@ -186,7 +186,7 @@ def background_table(certificate: CertificateEntries) -> Table:
 
 
 def _or_none(value: object, unit: str) -> str:
-    return "none seen" if number(value) == 0 else quantity(value, unit)
+    return "none found" if number(value) == 0 else quantity(value, unit)
 
 
 def departure_table(certificate: CertificateEntries) -> Table:

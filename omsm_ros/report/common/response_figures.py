@@ -46,7 +46,7 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
     made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
     gain, phase, error = axes[:, 0]
-    draw_gain(gain, frequency, identified, true, title="Response of the probe to the carriage")
+    draw_gain(gain, frequency, identified, true, title="Response of the probe to the axis")
     draw_phase(phase, frequency, identified, true)
     phase.set_xlabel("")
     _draw_error(error, frequency, identified, true)
@@ -166,7 +166,7 @@ def step_response(
 
     Each array is of shape (n,), positions in [m].
 
-    time: [s];  encoder: position of the carriage
+    time: [s];  encoder: position of the axis
     probe: motion the probe saw, -distance / static gain on a fixed target, in any offset
     predicted: encoder through the identified G_m
     """
@@ -184,11 +184,11 @@ def step_response(
     def draw(where: Axes, value: FloatArray, colour: str, text: str, line: Any = "-") -> None:
         where.plot(since, value, color=colour, linewidth=1.3, linestyle=line, label=text)
 
-    draw(upper, (edge - edge[0]) / MICROMETRE_M, style.MUTED, "carriage (encoder)")
+    draw(upper, (edge - edge[0]) / MICROMETRE_M, style.MUTED, "axis (encoder)")
     draw(upper, (seen - edge[0]) / MICROMETRE_M, style.BEFORE, "probe")
-    draw(lower, (seen - edge) / NANOMETRE_M, style.BEFORE, "probe − carriage")
+    draw(lower, (seen - edge) / NANOMETRE_M, style.BEFORE, "probe − axis")
     if predicted is not None:
-        model, name = predicted[window], "carriage through $G_m$"
+        model, name = predicted[window], "axis through $G_m$"
         draw(upper, (model - edge[0]) / MICROMETRE_M, style.AFTER, name, (0, (3, 2)))
         draw(lower, (seen - model) / NANOMETRE_M, style.AFTER, f"probe − {name}")
     style.label(upper, y="motion [µm]", title="Steepest move")

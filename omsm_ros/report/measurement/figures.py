@@ -251,7 +251,7 @@ def overview_figure(
     for axes in (gain, phase):
         style.quiet(axes)
     at = frequencies(identified)
-    draw_gain(gain, at, identified, true, title="Response of the probe to the carriage")
+    draw_gain(gain, at, identified, true, title="Response of the probe to the axis")
     draw_phase(phase, at, identified, true)
     right.align_ylabels()
     return made

@@ -53,7 +53,7 @@ DYNAMICS = {
         "Gain, phase, and the error that a sinusoidal motion would leave. Grey: beyond the "
         "frequency up to which the identified response is trusted."
     ),
-    "step_response": Caption("One edge of the step test, and what the model leaves of it."),
+    "step_response": Caption("One edge of the step test, and the residual of the model."),
 }
 FORM = {
     "zernike_terms": Caption(
@@ -66,7 +66,7 @@ CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything on the page; what is absent leaves no hole.
+    """Everything on the page; what is absent is left out.
 
     title: of the page;  date: as it is to be printed
     summary: the content of ``summary.json``: optional ``samples`` (an account as its

@@ -113,23 +113,23 @@ class TestStepResponse:
     def test_shows_the_steepest_edge_from_its_start(self):
         encoder, probe, predicted = self.recorded()
         upper, lower = step_response(self.TIME, encoder, probe, predicted).get_axes()
-        at, value = line(upper, "carriage (encoder)")
+        at, value = line(upper, "axis (encoder)")
         assert np.ptp(value) == pytest.approx(10.0, rel=0.01)
         assert np.interp(10.0, at, value) == pytest.approx(5.0, abs=0.6)
-        at, value = line(lower, "probe − carriage")
+        at, value = line(lower, "probe − axis")
         # 5 ms late on 0.5 µm/ms.
         assert value.min() == pytest.approx(-2500, rel=0.01)
 
     def test_a_right_prediction_leaves_nothing_whatever_the_offset(self):
         lower = step_response(self.TIME, *self.recorded()).get_axes()[1]
-        _, value = line(lower, "probe − carriage through $G_m$")
+        _, value = line(lower, "probe − axis through $G_m$")
         assert np.abs(value).max() < 1e-6
 
     def test_the_prediction_may_be_missing(self):
         encoder, probe, _ = self.recorded()
         upper, lower = step_response(self.TIME, encoder, probe).get_axes()
-        assert labels(upper) == {"carriage (encoder)", "probe"}
-        assert labels(lower) == {"probe − carriage"}
+        assert labels(upper) == {"axis (encoder)", "probe"}
+        assert labels(lower) == {"probe − axis"}
 
     def test_the_twin_step_test(self, step_test, true_calibration):
         """With the true dynamics only the probe's 10 nm of noise are left."""
@@ -140,8 +140,8 @@ class TestStepResponse:
         probe = -step_test.distance.distance / true_calibration.static_gain
         time = 1e-3 * np.arange(len(z))
         _, lower = step_response(time, z, probe, predicted).get_axes()
-        _, before = line(lower, "probe − carriage")
-        _, after = line(lower, "probe − carriage through $G_m$")
+        _, before = line(lower, "probe − axis")
+        _, after = line(lower, "probe − axis through $G_m$")
         assert np.abs(before).max() > 200
         assert np.std(after) < 15
 
