@@ -251,7 +251,7 @@ def lateral_lag() -> list[Row]:
     found = sideways_lag(scans, calibration)
     error = abs(found.lag - latency)
     put_right = corrected(calibration, made.axes, made.distance, lateral_lag=found.lag)
-    before, after = (_surface_rms(points) / cell.probe.noise for points in (scans[-1], put_right))
+    before, after = (_surface_rms(points) / cell.probe.noise for points in (points, put_right))
     return [
         at_most("sideways lag, error / stated uncertainty", error / found.uncertainty, "1", 2.0),
         at_most("sideways lag, stated uncertainty", found.uncertainty / MICROSECOND_S, "us", 1.0),

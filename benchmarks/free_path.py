@@ -37,7 +37,7 @@ _CASES: tuple[tuple[str, Motion, Plant, slice, float], ...] = (
 
 def rows(full: bool) -> Iterator[Row]:
     """Least share over frequency of runs whose band holds the truth, and how far it is trusted."""
-    runs = 100 if full else 8
+    runs = 100 if full else 4
     for name, motion, plant, part, reaches in _CASES:
         found = [
             identify(_recorded(seed, motion, plant, part)).calibration

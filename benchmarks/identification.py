@@ -51,9 +51,9 @@ _DEFAULT = StepTest()
 def rows(full: bool) -> Iterator[Row]:
     """Every study, as it gets done; few runs of each unless ``full``."""
     yield from accuracy(200 if full else 30)
-    yield from coloured(100 if full else 20)
+    yield from coloured(100 if full else 10)
     yield from sharp_edges(10 if full else 3)
-    yield from other_plants(20 if full else 6)
+    yield from other_plants(20 if full else 3)
     yield from speed()
 
 
