@@ -3,8 +3,8 @@
 Every disturbance of the twin's catalogue that a step test can meet, of medium size; with
 ``--full`` small and large too, and in pairs. A calibration may be accepted, accepted with
 reservations (what was found is modelled or held by a wider band), or rejected with the cause; it
-must not be accepted with a response more than three stated standard uncertainties from the truth where that costs
-more than five nanometres on the paper's scan. With
+must not be accepted with a response more than three stated standard uncertainties from the truth
+where that costs more than five nanometres on the paper's scan. With
 ``--full`` the table goes to docs/disturbances.md.
 """
 
