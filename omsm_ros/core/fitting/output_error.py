@@ -269,10 +269,7 @@ class _Cache:
 
 
 def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
-    """Return the best local minimum found from ``starts``, each a ψ.
-
-    Each start gets a few evaluations; the best of them then runs to its minimum.
-    """
+    """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them."""
     scaled = problem.parametrised(structure)
     cache = _Cache(problem, scaled)
     best, best_cost = starts[0], np.inf
