@@ -18,6 +18,7 @@ from omsm_ros.jobs.compare_measurements import (
     compare_measurements,
     write_difference,
 )
+from omsm_ros.storage.files import REPORT
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import NANOMETRE_M
@@ -81,9 +82,9 @@ def _difference(args: argparse.Namespace) -> Facts:
     )
     nominal = load_surface(args.nominal) if args.nominal else None
     found, facts = compare_measurements(args.a, args.b, ways, nominal)
-    with result_folder(args.out, (MAP, DIFFERENCE)) as out:
+    with result_folder(args.out, (MAP, REPORT, DIFFERENCE)) as out:
         write_difference(out, found, facts)
-    return {**facts, "files": {"difference": DIFFERENCE, "map": MAP}}
+    return {**facts, "files": {"difference": DIFFERENCE, "map": MAP, "report": REPORT}}
 
 
 def _show_difference(facts: Facts) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,14 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import FileError
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.fields_file import load_fields
-from omsm_ros.storage.files import SUMMARY, SYSTEMATIC, read_text, save_json
+from omsm_ros.storage.files import (
+    REPORT,
+    SUMMARY,
+    SYSTEMATIC,
+    read_text,
+    save_json,
+    save_text,
+)
 from omsm_ros.storage.maps.columns_file import write_columns
 from omsm_ros.storage.maps.length_units import LengthUnits
 from omsm_ros.storage.maps.read_map import read_points
@@ -112,13 +120,19 @@ def compare_measurements(
 
 
 def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> None:
-    """Write ``difference.csv`` and ``difference.json`` into ``out``."""
+    """Write ``difference.csv``, ``difference.json`` and ``report.html`` into ``out``."""
     matched, columns = found.matched, {}
     for name, values in (("x", matched.x), ("y", matched.y), ("difference", matched.difference)):
         columns[f"{name}_m"] = values
     if found.agreement is not None:
         columns["uncertainty_m"] = found.agreement.uncertainty
     write_columns(out / MAP, columns, csv=True)
+    # Here, because drawing takes longer to load than most of the rest.
+    from omsm_ros.report.difference.page import render
+
+    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    names = [Path(facts[key]["file"]).name for key in ("a", "b")]
+    save_text(out / REPORT, render(" and ".join(names), date, facts, found))
     save_json(out / DIFFERENCE, facts)
 
 

@@ -14,6 +14,8 @@ AGREE, DIFFER, CANNOT_TELL = "agree", "differ", "cannot tell"
 
 # Of pairs that agree one in a hundred may look as unlikely.
 _LEAST_PROBABILITY = 0.01
+# A term beyond one, which of pairs that agree one in twenty has, and all terms as unlikely as that.
+_UNLIKELY = 0.05
 # What is beyond one but not by this is as well chance as a difference.
 _PLAINLY_BEYOND = 1.25
 _LEAST_SHARED = 0.5
@@ -73,17 +75,19 @@ def _least_sure(found: Agreement) -> str:
 
 
 def _differences(found: Agreement) -> tuple[str, ...]:
+    largest, probability = found.largest, found.probability
+    plainly = abs(largest.e_n) > _PLAINLY_BEYOND
+    both = abs(largest.e_n) > 1 and probability < _UNLIKELY
     reasons = []
-    largest = found.largest
-    if abs(largest.e_n) > _PLAINLY_BEYOND:
+    if plainly or both:
         reasons.append(
             f"{_named(largest.n, largest.m)} differs by {largest.difference / NANOMETRE_M:.2f} nm "
             f"where {largest.expanded / NANOMETRE_M:.2f} nm are explained: E_n = {largest.e_n:.2f}"
         )
-    if found.probability < _LEAST_PROBABILITY:
+    if probability < _LEAST_PROBABILITY or both:
         reasons.append(
-            f"all terms together: a probability of {found.probability:.1g} if only the stated "
-            "errors were there"
+            f"all terms together: a probability of {probability:.1g} if only the stated errors "
+            "were there"
         )
     if found.farthest > _PLAINLY_BEYOND * found.allowed:
         x, y = (place / MILLIMETRE_M for place in found.at)

@@ -20,7 +20,7 @@ from matplotlib.image import imsave
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 from omsm_ros.report.common import style
-from omsm_ros.report.measurement.raster import rasterise
+from omsm_ros.report.measurement.raster import Raster, rasterise
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 _STEPS = 65_534
@@ -30,9 +30,10 @@ _COLOURS = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One map: ``heights`` [m] at x, y [m], each (n,), in ``unit`` "nm" or "µm".
+    """One map: ``heights`` [m] at x, y [m], each (n,), in ``unit`` "nm" or "µm"; numbers in "1".
 
     symmetric: colours about zero, for deviations; else from the least to the greatest
+    pitch: of the grid on which all points lie [m]; 0: they are scattered
     """
 
     name: str
@@ -41,6 +42,7 @@ class Layer:
     heights: FloatArray
     unit: str
     symmetric: bool = True
+    pitch: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +78,10 @@ def policy_of(text: str) -> str:
 
 
 def _entry(layer: Layer) -> dict[str, object]:
-    units = {"nm": NANOMETRE_M, "µm": MICROMETRE_M}
+    units = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "1": 1.0}
     if layer.unit not in units:
         raise DataError(f"unit {layer.unit!r} of a map is unknown, expected one of {[*units]}")
-    raster = rasterise(layer.x, layer.y, layer.heights)
+    raster = _on_its_grid(layer) if layer.pitch else rasterise(layer.x, layer.y, layer.heights)
     heights = raster.image / units[layer.unit]
     known = heights[np.isfinite(heights)]
     least, span = float(known.min()), float(np.ptp(known))
@@ -87,7 +89,7 @@ def _entry(layer: Layer) -> dict[str, object]:
     codes = np.where(np.isfinite(heights), 1 + np.round((heights - least) / step), 0)
     return {
         "name": layer.name,
-        "unit": layer.unit,
+        "unit": "" if layer.unit == "1" else layer.unit,
         "least": least,
         "step": step,
         "extent": [edge / MILLIMETRE_M for edge in raster.extent],
@@ -95,6 +97,20 @@ def _entry(layer: Layer) -> dict[str, object]:
         "robust": _limits(*np.percentile(known, _ROBUST_PERCENT), layer.symmetric),
         "png": _png(codes.astype(np.uint16)),
     }
+
+
+def _on_its_grid(layer: Layer) -> Raster:
+    """A pixel for each place of the layer's grid."""
+    left, bottom = (float(values.min()) for values in (layer.x, layer.y))
+    column, row = (
+        np.round((values - least) / layer.pitch).astype(np.int64)
+        for values, least in ((layer.x, left), (layer.y, bottom))
+    )
+    image = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    image[row, column] = layer.heights
+    left, bottom = left - layer.pitch / 2, bottom - layer.pitch / 2
+    right = left + image.shape[1] * layer.pitch
+    return Raster(image, (left, right, bottom, bottom + image.shape[0] * layer.pitch))
 
 
 def _limits(low: float, high: float, symmetric: bool) -> list[float]:

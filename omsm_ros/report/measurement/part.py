@@ -10,9 +10,11 @@ from omsm_ros.report.common.tables import Table, part
 from omsm_ros.report.common.verdict import Verdict
 
 _FIGURES = {
-    "peak_to_valley": "peak to valley",
-    "robust_peak_to_valley": "peak to valley of 99.5 %",
-    "rms": "rms",
+    "peak_to_valley_of_points": "of the points, with their noise: peak to valley",
+    "rms_of_points": "of the points, with their noise: rms",
+    "peak_to_valley": "of the part, less what noise and other errors add: peak to valley",
+    "robust_peak_to_valley": "of the part: peak to valley of 99.5 %",
+    "rms": "of the part: rms",
 }
 _CONFORMITY = {
     "holds": ("good", "The part holds its tolerance"),
@@ -58,7 +60,7 @@ def _expanded(figure: Mapping[str, Any]) -> str:
     """A figure with its expanded uncertainty, k = 2."""
     spread = figure.get("uncertainty")
     if spread is None:
-        return f"{quantity(figure['value'], 'm')}, its uncertainty not evaluated"
+        return quantity(figure["value"], "m")
     return f"{measured(figure['value'], 2 * spread, 'm')} (k = 2)"
 
 

@@ -13,6 +13,7 @@ from omsm_ros.report.measurement.part import (
 
 FORM = {
     "deviation": {
+        "peak_to_valley_of_points": {"value": 185e-9, "uncertainty": None},
         "peak_to_valley": {"value": 171e-9, "uncertainty": 30e-9},
         "robust_peak_to_valley": {"value": 124e-9, "uncertainty": 20e-9},
         "rms": {"value": 21.6e-9, "uncertainty": None},
@@ -61,8 +62,8 @@ def test_without_a_tolerance_nothing_is_called_good():
 
 def test_every_figure_comes_with_its_expanded_uncertainty():
     reasons = [r.replace("\u202f", " ") for r in verdict_on_part(summary(), FORM).reasons]
-    assert "peak to valley 171 nm ± 60 nm (k = 2)" in reasons
-    assert any(r.startswith("rms 21.6 nm, its uncertainty not evaluated") for r in reasons)
+    assert reasons[0] == "of the points, with their noise: peak to valley 185 nm"
+    assert any(r.endswith("peak to valley 171 nm ± 60 nm (k = 2)") for r in reasons)
 
 
 def test_a_part_that_was_not_registered_says_so():
