@@ -28,6 +28,8 @@ LEAST_TURNS = 1.5
 HIGHEST_ORDER = 12
 # One wave a turn is how the part sits on the chuck.
 LOWEST_ORDER = 2
+# On one circle two waves are its astigmatism, too.
+LOWEST_ON_CIRCLE = 3
 _DRIFT_DEGREE = 3
 _DEGREES = range(2, 15, 2)
 _USUAL_DEGREE = 6
@@ -37,6 +39,8 @@ _WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
 # Even samples that determine the form; it is smooth, and the rest would only cost time.
 _MOST_FITTED = 100_000
 _CHUNK = 16_384
+# So many times what an order and a figure make together, one of them is no longer known.
+_AGAINST = 1.5
 # Nearer to a whole number of waves a turn, in resolutions, it is one.
 _OWNED = 0.6
 # Radii within this part of the largest are one circle.
@@ -130,7 +134,7 @@ class FormFit:
             residual=residual,
             degree=self._degree,
             removed=float(np.std(self._height - residual)),
-            orders=tuple(_orders(basis, solution, spread)),
+            orders=tuple(_orders(basis, solution, spread, gram / len(chosen))),
             on_circle=basis.on_circle,
         )
 
@@ -284,10 +288,23 @@ def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> Float
     return np.concatenate(parts)
 
 
-def _orders(basis: _Basis, solution: FloatArray, spread: FloatArray) -> Iterator[Order]:
+def _orders(
+    basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
+) -> Iterator[Order]:
+    """Orders that stand by themselves; ``mean``: of products of columns (p, p).
+
+    Where the radius changes little, an order and a figure of the same harmonic may grow large
+    against each other: neither is known then, and the order counts as form.
+    """
     found = {name: place for place, name in enumerate(basis.names) if name[0] == "order"}
-    for k in range(LOWEST_ORDER, HIGHEST_ORDER + 1):
+    lowest = LOWEST_ON_CIRCLE if basis.on_circle else LOWEST_ORDER
+    for k in range(lowest, HIGHEST_ORDER + 1):
         if ("order", k, k) in found:
             cosine, sine = found["order", k, k], found["order", k, -k]
             worse = float(max(spread[cosine], spread[sine]))
-            yield Order(k, float(solution[cosine]), float(solution[sine]), worse)
+            own = Order(k, float(solution[cosine]), float(solution[sine]), worse)
+            alike = [i for i, (kind, _, m) in enumerate(basis.names) if abs(m) == k]
+            part = solution[alike]
+            together = float(part @ mean[np.ix_(alike, alike)] @ part)
+            if own.amplitude**2 / 2 <= _AGAINST**2 * together:
+                yield own

@@ -96,7 +96,7 @@ class Place:
 def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
     """Yield what ``line`` of ``scan`` may be; of a vibration also what folds to it."""
     if TIME in line.possible:
-        seen, spread = line.possible[TIME], _spread(scan, line, TIME)
+        seen, spread = line.possible[TIME], spread_of(scan, line, TIME)
         rate = scan.signal.rate
         yield Hypothesis(VIBRATION, TIME, seen, spread)
         for folds in range(1, _MOST_FOLDS + 1):
@@ -104,7 +104,7 @@ def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
                 yield Hypothesis(VIBRATION, TIME, image, spread, folds)
     for coordinate in (PATH, RADIUS):
         if coordinate in line.possible:
-            spread = _spread(scan, line, coordinate)
+            spread = spread_of(scan, line, coordinate)
             yield Hypothesis(PART, coordinate, line.possible[coordinate], spread)
     if (order := whole_order(scan, line)) is not None:
         yield Hypothesis(SYNCHRONOUS, TURN, float(order), 0.0)
@@ -123,7 +123,8 @@ def whole_order(scan: StudiedScan, line: Line) -> int | None:
     return order
 
 
-def _spread(scan: StudiedScan, line: Line, coordinate: str) -> float:
+def spread_of(scan: StudiedScan, line: Line, coordinate: str) -> float:
+    """How far the true frequency in ``coordinate`` may be from where the line was seen."""
     return (
         _TIMES_UNCERTAINTY * _own_spread(scan, line, coordinate)
         + _OTHER_BIN * scan.resolution(coordinate)

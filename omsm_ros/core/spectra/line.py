@@ -9,12 +9,14 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.spectra.coordinates import Coordinate, same_line
-from omsm_ros.core.spectra.scan_signal import PATH
+from omsm_ros.core.spectra.scan_signal import PATH, ScanSignal
 
 CLOSEST = 0.6
 """Closer than this, in resolutions, a line is another's side lobe; two cannot be fitted."""
 
 _FITTING_STEPS = 4
+# Frequencies to either side of where a known texture is looked for.
+_MOST_TRIED = 200
 _CHUNK = 32_768
 # Of its power that a line in another coordinate takes, from which on that one is tried.
 _LIKE = 0.25
@@ -45,9 +47,20 @@ class Line:
         return float(np.hypot(self.cosine, self.sine))
 
 
-def texture(frequency: float) -> Line:
-    """Return a line along the path at ``frequency`` [1/m] that is still to be fitted."""
-    return Line(coordinate=PATH, frequency=frequency, cosine=0.0, sine=0.0)
+def texture(signal: ScanSignal, values: FloatArray, frequency: float, spread: float) -> Line:
+    """Return the strongest line along the path within ``spread`` of ``frequency`` [1/m]."""
+    place = signal.path - float(np.mean(signal.path))
+    step = 0.5 / float(np.ptp(place))
+    reach = min(int(spread / step) + 1, _MOST_TRIED)
+    tried = frequency + step * np.arange(-reach, reach + 1)
+    # From one frequency to the next every sample turns by the same angle.
+    turning = values * np.exp(-2j * np.pi * tried[0] * place)
+    turn = np.exp(-2j * np.pi * step * place)
+    power = np.empty(len(tried))
+    for k in range(len(tried)):
+        power[k] = abs(np.sum(turning))
+        turning = turning * turn
+    return Line(coordinate=PATH, frequency=float(tried[np.argmax(power)]), cosine=0.0, sine=0.0)
 
 
 def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> Line:

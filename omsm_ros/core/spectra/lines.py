@@ -80,11 +80,10 @@ def find_lines(
     lines = _free(fitted(list(known), coordinates, values), coordinates, reserved) if known else []
     residual = values - sum_of(lines, coordinates, len(values))
     taken = {name: list(places) for name, places in reserved.items()}
-    while len(lines) < MOST_LINES:
+    for _ in range(MOST_LINES):
         new = _strongest(signal, residual, searched, lines, taken)
         if not new:
             break
-        before = float(residual @ residual)
         for line in new:  # what moved away in the fit is not found again
             taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
         lines = fitted(lines + new, coordinates, values)
@@ -92,8 +91,6 @@ def find_lines(
         lines = in_their_coordinates(lines, new, coordinates, residual)
         lines = _free(lines, coordinates, reserved)
         residual = values - sum_of(lines, coordinates, len(values))
-        if float(residual @ residual) > before * (1 - 1e-6):
-            break
     return _judged(signal, lines, coordinates, residual)
 
 

@@ -35,6 +35,7 @@ from omsm_ros.core.spectra.hypotheses import (
     UNDECIDED,
     VIBRATION,
     StudiedScan,
+    spread_of,
     whole_order,
 )
 from omsm_ros.core.spectra.line import Line, sum_of, texture, waves_of
@@ -44,6 +45,7 @@ from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 
 # What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
 _LEAST_FELT, _MOST_FELT = 0.1, 30.0
+_OF_AN_ORDER = 0.25
 # The first makes a line's frequency right, the second its amplitude.
 _TURNS_OF_FITTING = 2
 # So many felt lines would agree with a line of the scan by chance that they say nothing.
@@ -72,13 +74,16 @@ class Named:
 
 
 def study(
-    signal: ScanSignal, felt: Felt | None = None, textures: Sequence[float] = ()
+    signal: ScanSignal,
+    felt: Felt | None = None,
+    textures: Sequence[tuple[float, float]] = (),
 ) -> StudiedScan:
     """Take form and lines of one scan apart.
 
-    textures: waves along the path [1/m] that are known to be there, too fine to be searched for
+    textures: waves along the path [1/m] that are known to be there, too fine to be searched for,
+        and how well they are known
     """
-    formless, spectrum = _apart(signal, [texture(frequency) for frequency in textures])
+    formless, spectrum = _apart(signal, textures)
     return StudiedScan(
         signal=signal,
         formless=formless,
@@ -101,23 +106,31 @@ def study_all(scans: Sequence[tuple[ScanSignal, Felt | None]]) -> list[StudiedSc
     ]
 
 
-def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[float]:
+def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float, float]]:
+    """Waves beyond the reach of ``one``, and how well they are known, the best known first."""
     path = one.coordinates.get(PATH)
     if path is None or path.proportional_to_time:
         return []
-    found = [
-        line.possible[PATH]
+    found = sorted(
+        (spread_of(other, line, PATH), line.possible[PATH])
         for other in studied
         for line in other.lines
-        if other is not one and line.coordinate == PATH and line.possible[PATH] > path.highest
-    ]
-    return sorted(found)
+        if other is not one and PATH in line.possible and line.possible[PATH] > path.highest
+    )
+    kept: list[tuple[float, float]] = []
+    for spread, wave in found:
+        if all(abs(wave - known) > spread + other for known, other in kept):
+            kept.append((wave, spread))
+    return kept
 
 
-def _apart(signal: ScanSignal, known: Sequence[Line]) -> tuple[Formless, LineSpectrum]:
+def _apart(
+    signal: ScanSignal, textures: Sequence[tuple[float, float]]
+) -> tuple[Formless, LineSpectrum]:
     """Form and lines, fitted beside each other: a line near an order leaks into it."""
     form = FormFit(signal)
     formless = form.without()
+    known = [texture(signal, formless.residual, wave, spread) for wave, spread in textures]
     spectrum = find_lines(signal, formless.residual, known, form.owned())
     if not spectrum.lines:
         return formless, spectrum
@@ -139,19 +152,18 @@ def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
         if sigma < LEAST_SIGMA:
             continue
         turn = coordinates[TURN]
-        possible = {TURN: float(found.order)}
-        if turn.proportional_to_time:
-            possible |= {
-                name: found.order * turn.pace / c.pace
-                for name, c in coordinates.items()
-                if c.proportional_to_time and name != TURN
-            }
+        possible = {TURN: float(found.order)} | {
+            name: found.order * turn.pace / c.pace
+            for name, c in coordinates.items()
+            if c.like == turn.like and name != TURN
+        }
         yield Line(
             coordinate=TURN,
             frequency=float(found.order),
             cosine=found.cosine,
             sine=found.sine,
-            frequency_uncertainty=float(np.sqrt(3 / ratio) / np.pi * turn.resolution),
+            # A line so near to a whole number of waves a turn is taken for one.
+            frequency_uncertainty=_OF_AN_ORDER * turn.resolution,
             amplitude_uncertainty=found.uncertainty,
             significance=sigma,
             possible=possible,
@@ -275,7 +287,7 @@ def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
     """What one scan says by itself: its pace changed, and the line is sharp in one kind only."""
     scan, line = done.scans[key[0]], evidence.line
     kinds = {t.kind for t in evidence.tested if t.alive}
-    if TIME not in line.possible and kinds == {PART}:
+    if set(line.possible) == {PATH}:
         text = f"sharp {needs.along(line.coordinate)}, spread over time, for the pace changed"
         return Named(line=line, kind=PART, evidence=(text,), wavelength=1 / line.frequency)
     if TIME not in line.possible and set(line.possible) <= {TURN} and SYNCHRONOUS in kinds:

@@ -1,0 +1,198 @@
+"""Is every line of a scan named rightly? Random mixtures; a measured record of vibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.mixtures import MadeScan, Mixture, TrueLine, mixture
+from benchmarks.row import Row, at_least, at_most, not_compared, shown
+from omsm_ros.core.dynamics.aliasing import folded_frequency
+from omsm_ros.core.spectra.felt import felt
+from omsm_ros.core.spectra.hypotheses import (
+    ARTEFACT,
+    FOLDED,
+    PART,
+    SYNCHRONOUS,
+    UNDECIDED,
+    VIBRATION,
+    StudiedScan,
+)
+from omsm_ros.core.spectra.ripple_guard import Named, name_lines, study_all
+from omsm_ros.core.spectra.scan_signal import scan_signal
+
+_FIRST_SEED = 4000
+_RECORDS = Path(__file__).parents[2] / "shared/data/vibration/pyxis_linear_stage"
+_COORDINATE = {"t": "time", "s": "path", "r": "radius", "c": "turn"}
+# Local: amplitude over the standard deviation of a sine's or cosine's.
+_CERTAIN = 8.0
+
+
+def rows(full: bool) -> Iterator[Row]:
+    """Shares of lines named rightly, and how far predicted images are off."""
+    runs = 100 if full else 12
+    yield from _mixtures(runs)
+    yield from _measured()
+
+
+# ------------------------------------------------------------------------------ mixtures
+
+
+def _mixtures(runs: int) -> Iterator[Row]:
+    counted: Counter[str] = Counter()
+    for seed in range(_FIRST_SEED, _FIRST_SEED + runs):
+        counted += judged(mixture(seed))
+    peaks = counted["right"] + counted["wrong"] + counted["undecided"]
+    yield at_least(
+        "lines above 3 σ named rightly", 100 * counted["right"] / peaks, "%", 95, runs=runs
+    )
+    yield at_most(
+        "folded vibrations called on the part", counted["folded on the part"], "", 0, runs=runs
+    )
+    yield shown("lines above 3 σ", peaks, "", runs=runs)
+    yield shown("of them undecided", 100 * counted["undecided"] / peaks, "%", runs=runs)
+    yield shown("of them named wrongly", 100 * counted["wrong"] / peaks, "%", runs=runs)
+    yield shown("of them no line at all", 100 * counted["none"] / peaks, "%", runs=runs)
+    seen = counted["found"] + counted["missed"]
+    yield at_least(
+        f"true lines beyond {_CERTAIN:g} σ that are found", 100 * counted["found"] / seen, "%", 95,
+        runs=runs,
+    )  # fmt: skip
+
+
+def judged(made: Mixture) -> Counter[str]:
+    """Count what the guard says of a mixture against what is true."""
+    studied = study_all([_as_signal(scan) for scan in made.scans])
+    counted: Counter[str] = Counter()
+    for scan, own, named in zip(made.scans, studied, name_lines(studied), strict=True):
+        for row in named:
+            true = _true_line(made.lines, scan, own, row)
+            expected = _expected(true, scan) if true else set()
+            right = row.kind in expected
+            counted["right" if right else "undecided" if row.kind == UNDECIDED else "wrong"] += 1
+            counted["none"] += true is None
+            counted["folded on the part"] += row.kind == PART and FOLDED in expected
+        for line in made.lines:
+            if (
+                _expected(line, scan)
+                and line.amplitude > _CERTAIN * own.spectrum.noise * (2 / len(scan.sample)) ** 0.5
+            ):
+                found = any(_is(line, scan, own, row) for row in named)
+                counted["found" if found else "missed"] += 1
+    return counted
+
+
+def _as_signal(scan: MadeScan):  # type: ignore[no-untyped-def]
+    every = np.arange(len(scan.radius))
+    signal = scan_signal(
+        scan.name,
+        1 / scan.rate,
+        (scan.sample, scan.height),
+        (every, scan.radius, np.zeros(len(every)), scan.angle),
+    )
+    if scan.acceleration is None:
+        return signal, None
+    return signal, felt(1 / scan.acceleration_rate, {"z": scan.acceleration})
+
+
+def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
+    """The right names of a line; none where it cannot be seen."""
+    place = scan.place[line.over]
+    span = float(np.ptp(place))
+    if line.frequency * span < 6:
+        return set()
+    if line.what == "spindle":
+        return {SYNCHRONOUS}
+    in_time = line.frequency * span / (len(place) / scan.rate)
+    if line.what == "vibration":
+        image = float(folded_frequency(in_time, scan.rate))
+        if image * len(place) / scan.rate < 6:
+            return set()
+        return {FOLDED} if in_time > scan.rate / 2 else {VIBRATION}
+    if in_time > scan.rate / 2:
+        # Uneven steps along the path have no image; the wave is seen at its own length.
+        steady = np.ptp(np.diff(place)) < 1e-9 * np.ptp(place)
+        return {ARTEFACT} if steady else {PART}
+    return {PART}
+
+
+def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: Named) -> bool:
+    """True if a row is at the place of a true line, within two resolutions."""
+    name = _COORDINATE[line.over]
+    coordinate = own.coordinates.get(name)
+    if coordinate is None:
+        return False
+    if name in row.line.possible:
+        off = abs(row.line.possible[name] - line.frequency) / coordinate.resolution
+        if off < 2:
+            return True
+    if not coordinate.proportional_to_time or "time" not in row.line.possible:
+        return False
+    image = float(folded_frequency(line.frequency * coordinate.pace, scan.rate))
+    return abs(row.line.possible["time"] - image) * own.signal.duration < 2
+
+
+def _true_line(
+    lines: list[TrueLine], scan: MadeScan, own: StudiedScan, row: Named
+) -> TrueLine | None:
+    """The true line at a row's place; of several the one of the row's own size."""
+    near = [line for line in lines if _is(line, scan, own, row)]
+    return min(near, key=lambda line: abs(line.amplitude - row.line.amplitude), default=None)
+
+
+# ------------------------------------------------------------------------ a measured record
+
+
+def _measured() -> Iterator[Row]:
+    name = (
+        "peaks of a linear stage at 4 kHz that, decimated to 1 kHz, are within a bin of their image"
+    )
+    if not _RECORDS.is_dir():
+        yield not_compared(name, "%", ">= 100", f"no {_RECORDS.name} here")
+        return
+    right = total = 0
+    worst = 0.0
+    for path in sorted(_RECORDS.glob("*250us*.txt")):
+        for axis, off in image_errors(np.loadtxt(path) * 9.81 / 16384, 4000.0, 4):
+            del axis
+            total += 1
+            right += off <= 1.0
+            worst = max(worst, off)
+    yield at_least(name, 100 * right / max(total, 1), "%", 100, runs=total)
+    yield shown("farthest of them", worst, "bins", runs=total)
+
+
+def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[int, float]]:
+    """How far from its predicted place each folded peak is found, in bins; by axis."""
+    slow = rate / every
+    for axis in range(counts.shape[1]):
+        values = counts[:, axis]
+        whole = felt(1 / rate, {"z": values})
+        folded = felt(every / rate, {"z": values[::every]})
+        resolution = rate / len(values)
+        for line in whole.lines:
+            # Weak lines may drown in what else folds onto them.
+            floor = _noise_of(values[::every], folded)
+            if line.acceleration < 4 * floor:
+                continue
+            place = float(folded_frequency(line.frequency, slow))
+            if not 5 * resolution < place < slow / 2 - resolution:
+                continue
+            if _crowded(whole, line.frequency, slow, place, resolution):
+                continue
+            off = min((abs(f.frequency - place) for f in folded.lines), default=np.inf)
+            yield axis, off / resolution
+
+
+def _noise_of(values: np.ndarray, found) -> float:  # type: ignore[no-untyped-def]
+    power = np.var(values) - sum(line.acceleration**2 / 2 for line in found.lines)
+    return float(np.sqrt(2 * max(power, 0.0) * 2 / len(values)))
+
+
+def _crowded(whole, frequency: float, slow: float, place: float, resolution: float) -> bool:  # type: ignore[no-untyped-def]
+    """True if another line folds to within two bins: their images cannot be told apart."""
+    others = [f.frequency for f in whole.lines if f.frequency != frequency]
+    return any(abs(float(folded_frequency(f, slow)) - place) < 2 * resolution for f in others)
