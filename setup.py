@@ -17,6 +17,7 @@ NODES = (
     "axis_driver",
     "reference_driver",
     "accelerometer_driver",
+    "vibration_monitor",
     "recorder",
     "cell_emulator",
     "cell_demo",

@@ -7,9 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from omsm_msgs.msg import AccelerationBlock
+from rclpy.clock import Clock, ClockType
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
+from omsm_ros.emulators.acceleration import AccelerationFeed
 from omsm_ros.emulators.generic_stream import Faults
 from omsm_ros.emulators.players import EMULATED, emulated, line_for
 from omsm_ros.nodes.diagnostics import Report
@@ -17,6 +20,7 @@ from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.parameters import Parameter
 from omsm_ros.storage.claim import claimed
+from omsm_ros.storage import conversions
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.runtime_folder import runtime_folder
 from omsm_ros.twin.disturbances import NOTHING
@@ -30,6 +34,7 @@ _SCENARIO = (
     Parameter("step_rise", 20e-3, "edge of the step test [s]; 0 = sharp", quantities.RISE, unset=0),
     Parameter("sample_period", 1e-3, "of the trigger [s]", quantities.SAMPLE_PERIOD),
 )
+_FELT_PERIOD_S = 0.05
 _FAULTS = (
     Parameter("fault_noise", 0.0, "noise burst before a frame", quantities.PROBABILITY),
     Parameter("fault_flip", 0.0, "flipped bit in a frame", quantities.PROBABILITY),
@@ -51,6 +56,8 @@ PARAMETERS = (
 
 class CellEmulatorNode(ManagedNode):
     """Plays a motion on request; each motion starts the trigger counter anew.
+
+    An ``accelerometer`` among the disturbances is published on ``acceleration``.
 
     Services: ``~/step_test``, ``~/scan`` (std_srvs/Trigger) answer as soon as the motion has
     been worked out and starts; ``~/stop`` ends it.
@@ -83,11 +90,22 @@ class CellEmulatorNode(ManagedNode):
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
+        self._messages = conversions.ros_messages()
+        self._felt = self.publish_on(undo, AccelerationBlock, "acceleration")
+        self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
     def activate(self, undo: ExitStack) -> None:
         """Let motions be played."""
         undo.callback(self._player.halt)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.create_timer(_FELT_PERIOD_S, self._publish_felt, clock=steady)
+        undo.callback(self.destroy_timer, timer)
+
+    def _publish_felt(self) -> None:
+        block = self._feed.due(self._player.played) if self._feed else None
+        if block is not None:
+            self._felt.publish(conversions.acceleration_message(self._messages, block))
 
     def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
         if not self.active:
@@ -96,6 +114,7 @@ class CellEmulatorNode(ManagedNode):
             response.success, response.message = False, "a motion is running; stop it first"
         else:
             recording = motion_of(self._scenario, self._disturbances)
+            self._feed = AccelerationFeed(recording, self.get_clock().now().nanoseconds)
             self._player.start(recording, self.values["time_lapse"])
             response.success, response.message = True, f"{len(recording.axes)} samples"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 
-from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
+from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
 from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
@@ -28,6 +28,7 @@ _TOPICS = {
     topics.AXES_TOPIC: AxisBlock,
     topics.DISTANCE_TOPIC: DistanceBlock,
     topics.REFERENCE_TOPIC: DistanceBlock,
+    topics.ACCELERATION_TOPIC: AccelerationBlock,
     topics.CALIBRATION_TOPIC: Calibration,
     topics.POINTS_TOPIC: PointCloud2,
 }

@@ -31,15 +31,19 @@ from omsm_ros.core.spectra.line import (
     sum_of,
 )
 from omsm_ros.core.spectra.noise_floor import ratio_at, significance
-from omsm_ros.core.spectra.scan_signal import TIME, TURN, ScanSignal
+from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 
 LEAST_SIGMA = 3.0
 MOST_LINES = 40
 # Of the strongest that is left: weaker ones may be its side lobes.
 _TAKEN_TOGETHER = 0.3
 _APART_BINS = 8
+# Samples from one place to the next at which the rings are looked at.
+_STRIDE = 50
 # A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
 # and more of its power than jitter and encoders do.
+# A line and its like in another coordinate, of which that one takes more of the power.
+_SHADOW, _SHADOW_BINS = 0.3, 30
 _LOST_RATIO, _LOST_SHARE = 12.5, 0.05
 
 
@@ -86,6 +90,9 @@ def find_lines(
             break
         for line in new:  # what moved away in the fit is not found again
             taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
+        new = [line for line in new if not _is_shadow(line, lines, coordinates)]
+        if not new:
+            continue
         lines = fitted(lines + new, coordinates, values)
         residual = values - sum_of(lines, coordinates, len(values))
         lines = in_their_coordinates(lines, new, coordinates, residual)
@@ -125,11 +132,39 @@ def _strongest(
 def _reserved(
     coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
 ) -> dict[str, list[tuple[float, float]]]:
-    """Frequencies of ``owned`` waves a turn, over turns and over time."""
-    turn = coordinates.get(TURN)
+    """Frequencies of ``owned`` waves a turn, over turns, over time, and along all rings."""
+    turn, path = coordinates.get(TURN), coordinates.get(PATH)
     if turn is None:
         return {}
-    return {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
+    found = {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
+    if path is not None:
+        # So many turns are in a metre of the innermost ring, and of the outermost.
+        ring = np.diff(turn.values[::_STRIDE]) / np.diff(path.values[::_STRIDE])
+        most, least = float(np.max(abs(ring))), float(np.min(abs(ring)))
+        found[PATH] = [
+            (
+                order * (most + least) / 2,
+                bins + order * (most - least) / 2 / path.resolution,
+            )
+            for order, bins in owned
+        ]
+    return found
+
+
+def _is_shadow(new: Line, known: Sequence[Line], coordinates: dict[str, Coordinate]) -> bool:
+    """True for what another coordinate makes of a line that is known; a fit of both would let
+    them grow against each other.
+    """
+    own = coordinates[new.coordinate]
+    for line in known:
+        other = coordinates[line.coordinate]
+        apart = abs(line.frequency * other.pace - new.frequency * own.pace)
+        if other.name == own.name or apart > _SHADOW_BINS * own.resolution * own.pace:
+            continue
+        share, frequency = same_line(other, line.frequency, own)
+        if share > _SHADOW and abs(frequency - new.frequency) < 2 * own.resolution:
+            return True
+    return False
 
 
 def _free(

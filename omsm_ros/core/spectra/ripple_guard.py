@@ -25,8 +25,9 @@ from omsm_ros.core.spectra.claims import (
     settled,
     size_elsewhere,
 )
+from omsm_ros.core.spectra.coordinates import Coordinate
 from omsm_ros.core.spectra.felt import Felt, FeltLine
-from omsm_ros.core.spectra.form_removal import FormFit, Formless
+from omsm_ros.core.spectra.form_removal import FormFit, Formless, Order
 from omsm_ros.core.spectra.hypotheses import (
     ARTEFACT,
     FOLDED,
@@ -46,6 +47,8 @@ from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 # What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
 _LEAST_FELT, _MOST_FELT = 0.1, 30.0
 _OF_AN_ORDER = 0.25
+# So near, in resolutions, a line and an order are not fitted apart.
+_LEAKS_BINS = 1.5
 # The first makes a line's frequency right, the second its amplitude.
 _TURNS_OF_FITTING = 2
 # So many felt lines would agree with a line of the scan by chance that they say nothing.
@@ -149,9 +152,9 @@ def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
     for found in formless.orders:
         ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
         sigma = float(significance(ratio, len(formless.orders)))
-        if sigma < LEAST_SIGMA:
-            continue
         turn = coordinates[TURN]
+        if sigma < LEAST_SIGMA or _beside_a_line(found, spectrum, turn):
+            continue
         possible = {TURN: float(found.order)} | {
             name: found.order * turn.pace / c.pace
             for name, c in coordinates.items()
@@ -168,6 +171,16 @@ def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
             significance=sigma,
             possible=possible,
         )
+
+
+def _beside_a_line(order: Order, spectrum: LineSpectrum, turn: Coordinate) -> bool:
+    """True if a stronger line is so near that the order may be its leakage."""
+    return any(
+        abs(line.possible[TURN] - order.order) < _LEAKS_BINS * turn.resolution
+        and line.amplitude > order.amplitude
+        for line in spectrum.lines
+        if TURN in line.possible
+    )
 
 
 def name_lines(scans: Sequence[StudiedScan]) -> list[list[Named]]:

@@ -1,0 +1,205 @@
+"""The spectrum of acceleration as it comes: levels by band and axis, and the height they move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.samples.blocks import AccelerationBlock, FloatArray
+from omsm_ros.core.spectra.density import Density, density
+from omsm_ros.errors import ConfigurationError
+
+AXES = ("x", "y", "z")
+PROBE, CARRIAGE = "probe", "carriage"
+"""Where the accelerometer sits: what it feels the encoder does not see, or sees."""
+
+# A line is spread over ±4 resolutions by the window; four times as many make a band.
+_LEAST_RESOLUTIONS = 16
+_LOBE = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VibrationLevels:
+    """What shakes, averaged over the last windows.
+
+    bands: (from, to) [Hz];  rms: of each axis [m/s²], one value a band
+    line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
+    effect: on a height, rms, one value a band [m]; None where it is not known
+    total_effect: of all bands together [m];  windows: averaged so far
+    """
+
+    bands: tuple[tuple[float, float], ...]
+    rms: dict[str, tuple[float, ...]]
+    line: tuple[str, float, float]
+    effect: tuple[float, ...] | None
+    total_effect: float | None
+    windows: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MonitorOptions:
+    """How to look.
+
+    edges: of the bands, rising [Hz];  window: length of a spectrum [s]
+    averages: spectra over which levels are averaged
+    mount: ``probe`` or ``carriage``;  axis: along which a height is measured
+    """
+
+    edges: tuple[float, ...] = (5.0, 50.0, 150.0, 500.0, 2000.0)
+    window: float = 1.0
+    averages: int = 4
+    mount: str = PROBE
+    axis: str = "z"
+
+    def __post_init__(self) -> None:
+        rising = len(self.edges) > 1 and all(a < b for a, b in pairwise(self.edges))
+        least = _LEAST_RESOLUTIONS / self.window
+        if not rising or not self.edges[0] > 0 or self.edges[1] - self.edges[0] < least:
+            raise ConfigurationError(
+                f"bands {self.edges!r} Hz, expected two or more rising edges above zero, the "
+                f"first {least:g} Hz or more wide for a window of {self.window:g} s"
+            )
+        if self.mount not in (PROBE, CARRIAGE) or self.axis not in AXES:
+            raise ConfigurationError(
+                f"accelerometer on {self.mount!r}, height along {self.axis!r}; expected "
+                f"{PROBE!r} or {CARRIAGE!r}, and one of {AXES!r}"
+            )
+
+
+@dataclass
+class RunningSpectrum:
+    """Takes blocks, keeps the average of half overlapping windows (Welch 1967).
+
+    received, lost: samples;  restarts: where the counter did not go on or the period changed
+    """
+
+    options: MonitorOptions
+    received: int = 0
+    lost: int = 0
+    restarts: int = 0
+    _period: float = 0.0
+    _next: int = -1
+    _held: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
+    _mean: dict[str, Density] = field(default_factory=dict)
+    _windows: int = 0
+
+    def push(self, block: AccelerationBlock) -> None:
+        """Take the next block."""
+        self.received += len(block)
+        if block.first_sample != self._next or block.sample_period != self._period:
+            self.restarts += self._next >= 0
+            self._begin(block)
+        self._next = block.first_sample + len(block)
+        values = np.array([block.x, block.y, block.z], np.float64)
+        self.lost += int(np.count_nonzero(~np.isfinite(values).all(axis=0)))
+        self._held = np.hstack([self._held, values])
+        size = self._size
+        while self._held.shape[1] >= size:
+            self._add(self._held[:, :size])
+            self._held = self._held[:, size // 2 :]
+
+    @property
+    def _size(self) -> int:
+        return max(round(self.options.window / self._period), 2 * _LEAST_RESOLUTIONS)
+
+    def _begin(self, block: AccelerationBlock) -> None:
+        self._held = np.empty((3, 0))
+        if block.sample_period != self._period:
+            self._mean, self._windows = {}, 0
+        self._period = block.sample_period
+
+    def _add(self, window: FloatArray) -> None:
+        if not np.isfinite(window).all():
+            return
+        self._windows += 1
+        share = 1.0 / min(self._windows, self.options.averages)
+        for axis, values in zip(AXES, window, strict=True):
+            new = density(values - np.mean(values), self._period)
+            old = self._mean.get(axis, new)
+            mixed = old.density + share * (new.density - old.density)
+            self._mean[axis] = Density(new.frequency, np.asarray(mixed), new.step)
+
+    def levels(self, response: TransferFunction | None = None) -> VibrationLevels | None:
+        """Return the levels now; None before the first window is full.
+
+        response: from encoder to probe, as identified; needed for the effect of a vibration that
+            the encoder sees, ``|1 - G| a / ω²`` (Eq. 5). What it does not see is ``a / ω²``.
+        """
+        if not self._mean:
+            return None
+        nyquist = 0.5 / self._period
+        edges = [edge for edge in self.options.edges if edge < nyquist]
+        bands = tuple(
+            pairwise([*edges, nyquist] if len(edges) < len(self.options.edges) else edges)
+        )
+        effect = self._effect(bands, response)
+        return VibrationLevels(
+            bands=bands,
+            rms={
+                axis: tuple(spectrum.power(*band) ** 0.5 for band in bands)
+                for axis, spectrum in self._mean.items()
+            },
+            line=self._strongest(bands),
+            effect=effect,
+            total_effect=None if effect is None else float(np.sqrt(np.sum(np.square(effect)))),
+            windows=self._windows,
+        )
+
+    def _effect(
+        self, bands: Sequence[tuple[float, float]], response: TransferFunction | None
+    ) -> tuple[float, ...] | None:
+        seen = self.options.mount == CARRIAGE
+        if seen and response is None:
+            return None
+        spectrum = self._mean[self.options.axis]
+        omega = 2 * np.pi * np.maximum(spectrum.frequency, spectrum.step)
+        share = np.ones(len(omega))
+        if seen and response is not None:
+            share = np.abs(1 - response.response(spectrum.frequency))
+        height = Density(
+            spectrum.frequency, spectrum.density * (share / omega**2) ** 2, spectrum.step
+        )
+        return tuple(height.power(*band) ** 0.5 for band in bands)
+
+    def _strongest(self, bands: Sequence[tuple[float, float]]) -> tuple[str, float, float]:
+        found = []
+        for axis, spectrum in self._mean.items():
+            inside = (spectrum.frequency >= bands[0][0]) & (spectrum.frequency <= bands[-1][1])
+            top = int(np.argmax(np.where(inside, spectrum.density, 0.0)))
+            at = float(spectrum.frequency[top])
+            near = spectrum.power(at - _LOBE * spectrum.step, at + _LOBE * spectrum.step)
+            found.append((axis, at, float(np.sqrt(2 * near))))
+        return max(found, key=lambda line: line[2])
+
+
+@dataclass
+class Alarm:
+    """Raised at ``limit``, ended below ``release`` of it: it does not flutter about the limit.
+
+    raised: now;  times: how often it was raised
+    """
+
+    limit: float
+    release: float = 0.7
+    raised: bool = False
+    times: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.limit > 0 and 0 < self.release <= 1):
+            raise ConfigurationError(
+                f"alarm at {self.limit!r}, ended at {self.release!r} of it; expected a positive "
+                "limit and a share up to 1"
+            )
+
+    def update(self, value: float | None) -> bool:
+        """Return whether it is raised after ``value``; what is not known changes nothing."""
+        if value is not None:
+            if not self.raised and value >= self.limit:
+                self.raised, self.times = True, self.times + 1
+            elif self.raised and value < self.release * self.limit:
+                self.raised = False
+        return self.raised

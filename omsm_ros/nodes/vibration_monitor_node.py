@@ -1,0 +1,150 @@
+"""``vibration_monitor``: what shakes, how much, and what it does to a height."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Any
+
+from omsm_msgs.msg import AccelerationBlock
+
+from omsm_ros import quantities
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.spectra.running_spectrum import (
+    AXES,
+    CARRIAGE,
+    PROBE,
+    Alarm,
+    MonitorOptions,
+    RunningSpectrum,
+)
+from omsm_ros.errors import ConfigurationError, OmsmError
+from omsm_ros.nodes.calibration_topic import CalibrationTopic
+from omsm_ros.nodes.diagnostics import STALE, WARN, Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run
+from omsm_ros.nodes.topics import MessageInfo, listen
+from omsm_ros.parameters import Parameter
+from omsm_ros.readable import quantity
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import load_calibration
+
+PARAMETERS = (
+    Parameter("bands", "5 50 150 500 2000", "edges of the bands, rising [Hz]"),
+    Parameter("window", 1.0, "length of a spectrum [s]", quantities.WAIT),
+    Parameter("averages", 4, "spectra over which levels are averaged", quantities.COUNT),
+    Parameter("mount", PROBE, "where the accelerometer sits", choices=(PROBE, CARRIAGE)),
+    Parameter("axis", "z", "along which a height is measured", choices=AXES),
+    Parameter("alarm", 20e-9, "effect on a height at which to warn, rms [m]", quantities.STEP),
+    Parameter("release", 0.7, "share of it below which the alarm ends", quantities.PROBABILITY),
+    Parameter("calibration", "", "file with the response; empty = that of the topic alone"),
+)
+
+
+class VibrationMonitorNode(ManagedNode):
+    """Listens to ``acceleration`` and ``calibration``; speaks through its diagnostics."""
+
+    def __init__(self) -> None:
+        super().__init__("vibration_monitor", PARAMETERS)
+
+    def configure(self, undo: ExitStack) -> None:
+        """Take up options, alarm and calibration."""
+        values = self.values
+        self._running = RunningSpectrum(
+            MonitorOptions(
+                edges=_edges(values["bands"]),
+                window=values["window"],
+                averages=values["averages"],
+                mount=values["mount"],
+                axis=values["axis"],
+            )
+        )
+        self._alarm = Alarm(values["alarm"], values["release"])
+        self._refused = ""
+        self._calibration: Calibration | None = None
+        self._topic = CalibrationTopic(self, undo, self._use, listens=True)
+        if path := values["calibration"]:
+            self._calibration = load_calibration(path)
+
+    def activate(self, undo: ExitStack) -> None:
+        """Begin to listen."""
+        listen(self, undo, AccelerationBlock, "acceleration", self._take)
+
+    def _use(self, calibration: Calibration, _: int) -> None:
+        self._calibration = calibration
+
+    def _take(self, message: Any, _: MessageInfo) -> None:
+        try:
+            self._running.push(conversions.acceleration_block(message))
+        except OmsmError as err:
+            self._refused = str(err)
+            return
+        levels = self._levels()
+        was = self._alarm.raised
+        if levels is not None and self._alarm.update(levels.total_effect) != was:
+            text = "raised" if self._alarm.raised else "ended"
+            self.get_logger().warning(f"vibration alarm {text}: {self._line(levels)}")
+
+    def _levels(self) -> Any:
+        known = self._calibration
+        return self._running.levels(known.dynamics if known else None)
+
+    def _line(self, levels: Any) -> str:
+        axis, frequency, size = levels.line
+        return (
+            f"{quantity(levels.total_effect, 'm')} rms on a height, strongest "
+            f"{quantity(size, 'm/s²')} along {axis} at {quantity(frequency, 'Hz', 4)}"
+        )
+
+    def report(self) -> Report:
+        """Return levels by band and axis, the effect on a height, and the alarm."""
+        running, levels = self._running, self._levels()
+        report = Report("listening", {
+            "samples": running.received, "samples_lost": running.lost,
+            "restarts": running.restarts, "alarms": self._alarm.times,
+            "alarm": self._alarm.raised,
+        })  # fmt: skip
+        if levels is None:
+            report.add(STALE, "no full window of acceleration yet")
+        else:
+            report.message = self._line(levels)
+            report.values.update(_figures(levels))
+            if self._alarm.raised:
+                report.add(WARN, f"vibration beyond {quantity(self._alarm.limit, 'm')}: "
+                                 f"{self._line(levels)}")  # fmt: skip
+            if levels.effect is None:
+                report.add(WARN, "effect on a height not evaluated: no calibration yet")
+        if self._refused:
+            report.add(WARN, f"a block was refused: {self._refused}")
+        return report
+
+
+def _figures(levels: Any) -> dict[str, object]:
+    """Every level by its name, in SI."""
+    found: dict[str, object] = {"windows": levels.windows}
+    for place, (low, high) in enumerate(levels.bands):
+        band = f"{low:g}_{high:g}_hz"
+        for axis in AXES:
+            found[f"rms_{axis}_{band}"] = levels.rms[axis][place]
+        if levels.effect is not None:
+            found[f"height_{band}"] = levels.effect[place]
+    axis, frequency, size = levels.line
+    found |= {"line_axis": axis, "line_frequency": frequency, "line_amplitude": size}
+    return found | {"height": levels.total_effect}
+
+
+def _edges(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in text.split())
+    except ValueError as err:
+        raise ConfigurationError(
+            f"parameter 'bands' is {text!r}, expected numbers in Hz with spaces between"
+        ) from err
+
+
+def main() -> None:
+    """Entry point of ``ros2 run omsm_ros vibration_monitor``."""
+    run(VibrationMonitorNode)
+
+
+if __name__ == "__main__":
+    main()
