@@ -19,8 +19,8 @@ from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.parameters import Parameter
-from omsm_ros.storage.claim import claimed
 from omsm_ros.storage import conversions
+from omsm_ros.storage.claim import claimed
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.runtime_folder import runtime_folder
 from omsm_ros.twin.disturbances import NOTHING

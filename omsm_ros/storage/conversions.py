@@ -41,9 +41,6 @@ class Messages:
         return self.classes[name](**fields)
 
 
-_OURS = ("AxisBlock", "DistanceBlock", "AccelerationBlock", "Calibration")
-
-
 def ros_messages() -> Messages:
     """The message classes of the sourced ROS workspace."""
     from builtin_interfaces.msg import Time
@@ -53,7 +50,6 @@ def ros_messages() -> Messages:
 
     names = ("AxisBlock", "DistanceBlock", "AccelerationBlock", "Calibration")
     ours = {name: getattr(msg, name) for name in names}
-    ours = {name: getattr(msg, name) for name in _OURS}
     others = {c.__name__: c for c in (Time, Header, PointCloud2, PointField)}
     return Messages({**ours, **others}, _ros_sequence)
 
