@@ -19,6 +19,14 @@ DEFAULT_BAUD_RATE = 921_600
 _CHUNK_BYTES = 65_536
 ADS_SCHEME = "ads://"
 _TCP_SCHEME = "tcp://"
+# First probe after so many seconds, the next ones, and how many go unanswered before it is lost;
+# and what was sent is not waited for longer [ms].
+_KEEP_ALIVE = {
+    socket.TCP_KEEPIDLE: 5,
+    socket.TCP_KEEPINTVL: 2,
+    socket.TCP_KEEPCNT: 3,
+    socket.TCP_USER_TIMEOUT: 10_000,
+}
 _SERIAL_SCHEME = "serial://"
 
 
@@ -127,6 +135,11 @@ class TcpTransport:
                 "check address, network and power"
             ) from err
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # A device that lost its power says no farewell; its silence alone could be that of a
+        # triggered device at rest.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in _KEEP_ALIVE.items():
+            connection.setsockopt(socket.IPPROTO_TCP, option, value)
         self._socket = connection
 
     def read(self, timeout: float) -> bytes:

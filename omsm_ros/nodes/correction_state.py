@@ -39,11 +39,22 @@ class CorrectionState:
         self._period = dict.fromkeys(_STREAMS, 0.0)
         self._flows = {stream: Flow() for stream in _STREAMS}
         self._recent = RecentIncrease()
+        self._oldest_ns = 0
 
     def heard(self, stream: str, samples: int, period: float) -> None:
         """Note a block, whatever becomes of it."""
         self._heard[stream] += samples
         self._period[stream] = period
+
+    def arrived(self, stamp_ns: int) -> None:
+        """Note that a message arrived at ``stamp_ns`` [ns], of those now taken."""
+        self._oldest_ns = min(self._oldest_ns or stamp_ns, stamp_ns)
+
+    def done(self, now_ns: int) -> None:
+        """Note that all that arrived has been dealt with [ns]."""
+        if self._oldest_ns:
+            self.load.block(self._oldest_ns, now_ns)
+        self._oldest_ns = 0
 
     def report(self, corrector: Corrector | None, now: float, cpu: float) -> Report:
         """Weigh the state; ``corrector`` is None without a calibration."""

@@ -16,6 +16,7 @@ from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.merging import merged
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.jobs.predict_motion import predict_from
@@ -32,6 +33,7 @@ from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.calibration_folder import confined, since
 
+_STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 _COMPLAINT_PERIOD_S = 5.0
 _OVERRIDDEN = "_overridden"
 
@@ -50,6 +52,7 @@ class CorrectorNode(ManagedNode):
         self._frame = self.values["workpiece_frame"]
         self._corrector: Corrector | None = None
         self._state = CorrectionState()
+        self._waiting: dict[str, list[Any]] = {}
         self._points = self.publish_on(undo, PointCloud2, "points")
         self._topic = CalibrationTopic(
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
@@ -66,8 +69,10 @@ class CorrectorNode(ManagedNode):
     def activate(self, undo: ExitStack) -> None:
         """Begin to correct."""
         undo.callback(self._publish_rest)
-        listen(self, undo, AxisBlock, "axes", partial(self._take, "axes"))
-        listen(self, undo, DistanceBlock, "confocal", partial(self._take, "distance"))
+        for stream, (topic, kind) in _STREAMS.items():
+            self._waiting[stream] = []
+            take, push = partial(self._take, stream), partial(self._push, stream)
+            listen(self, undo, kind, topic, take, after=push)
 
     # ------------------------------------------------------------------- calibration
 
@@ -135,23 +140,36 @@ class CorrectorNode(ManagedNode):
     def _take(self, stream: str, message: Any, info: MessageInfo) -> None:
         samples = len(message.z if stream == "axes" else message.distance)
         self._state.heard(stream, samples, message.sample_period)
+        self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
             self._complain("samples come, but there is no calibration: call identify or load one")
             return
+        convert = conversions.axis_block if stream == "axes" else conversions.distance_block
         try:
-            if stream == "axes":
-                self._corrector.push_axes(conversions.axis_block(message))
-            else:
-                self._corrector.push_distance(conversions.distance_block(message))
+            self._waiting[stream].append(convert(message))
         except OmsmError as err:
-            self._state.refused[stream] += samples
-            self._state.refusal = str(err)
-            self._complain(f"{stream} block refused: {err}")
+            self._refuse(stream, samples, err)
+
+    def _push(self, stream: str) -> None:
+        """Correct what was taken; the more waited, the less a sample costs."""
+        blocks, self._waiting[stream] = self._waiting[stream], []
+        if self._corrector is None:
             return
+        push: Any = self._corrector.push_axes if stream == "axes" else self._corrector.push_distance
+        for block in merged(blocks):
+            try:
+                push(block)
+            except OmsmError as err:
+                self._refuse(stream, len(block), err)
         if (points := self._corrector.take()) is not None:
             self._publish(points)
-        self._state.load.block(info["received_timestamp"], time.time_ns())
+        self._state.done(time.time_ns())
+
+    def _refuse(self, stream: str, samples: int, err: OmsmError) -> None:
+        self._state.refused[stream] += samples
+        self._state.refusal = str(err)
+        self._complain(f"{stream} block refused: {err}")
 
     def _publish(self, points: SurfacePoints | None) -> None:
         if points is None:

@@ -94,7 +94,8 @@ class _Ending:
         self._heard, told = os.pipe()
         os.set_blocking(told, False)
         for number in _ENDING:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as SIGHUP is below nohup
+            # Below nohup, it is to be ignored.
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(told)
         threading.Thread(target=self._wait, daemon=True).start()

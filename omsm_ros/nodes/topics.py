@@ -59,10 +59,12 @@ def listen(
     qos: QoSProfile = SAMPLES_QOS,
     *,
     raw: bool = False,
+    after: Callable[[], None] = lambda: None,
     lost: Callable[[int], None] | None = None,
 ) -> Subscription:
     """Call ``callback(message, info)`` for each message, until ``undo``.
 
+    after: called when no more wait, or some hundreds have been taken
     lost: called with the number of messages in all that were lost on their way
     One round of the executor costs more than a message of one sample, so all that have come are
     taken in one.
@@ -71,6 +73,7 @@ def listen(
     def take_all(message: Any, info: MessageInfo) -> None:
         callback(message, info)
         take_waiting(made, callback)
+        after()
 
     events = SubscriptionEventCallbacks(
         message_lost=None if lost is None else lambda event: lost(event.total_count)

@@ -209,3 +209,19 @@ def test_senseless_numbers_are_refused() -> None:
         SerialTransport("/dev/ttyS0", 0)
     with pytest.raises(ConfigurationError, match="70000"):
         TcpTransport("host", 70_000)
+
+
+def test_a_tcp_device_that_vanishes_is_noticed(
+    server: socket.socket, tcp_transport: TcpTransport
+) -> None:
+    """The system asks whether it is still there, and gives it up within fifteen seconds."""
+    tcp_transport.open()
+    connection = tcp_transport._socket
+    assert connection is not None
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    idle, interval, count = (
+        connection.getsockopt(socket.IPPROTO_TCP, option)
+        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+    )
+    assert idle + interval * count <= 15
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) <= 15_000

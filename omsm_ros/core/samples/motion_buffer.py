@@ -6,6 +6,8 @@ from collections import deque
 from typing import Generic, TypeVar
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.continuity import TIME_JUMP_S
+from omsm_ros.units import NANOSECONDS_PER_S
 
 B = TypeVar("B", AxisBlock, DistanceBlock)
 
@@ -23,10 +25,17 @@ class BlockBuffer(Generic[B]):
         self.forgotten = 0
 
     def add(self, block: B) -> None:
-        """Append a block; a counter that falls back behind the last block begins a new motion."""
-        if self._blocks and block.first_sample < self._blocks[-1].first_sample:
+        """Append a block; a counter that falls back behind the last block begins a new motion.
+
+        Unless its stamp is a little older too: then the block came late, or once more.
+        """
+        if not self._blocks or block.first_sample >= self._blocks[-1].first_sample:
+            self._blocks.append(block)
+        elif 0 < self._blocks[-1].stamp_ns - block.stamp_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
+            self._blocks.insert(len(self._blocks) - 1, block)
+        else:
             self._forget(len(self._blocks))
-        self._blocks.append(block)
+            self._blocks.append(block)
         self._samples += len(block)
         while self._samples > self._capacity and len(self._blocks) > 1:
             self._forget(1)

@@ -4,9 +4,9 @@ from omsm_ros.core.samples.blocks import DistanceBlock
 from omsm_ros.core.samples.motion_buffer import BlockBuffer
 
 
-def block(first, length=100):
+def block(first, length=100, stamp_ns=0):
     return DistanceBlock(
-        stamp_ns=0, first_sample=first, sample_period=1e-3, distance=np.zeros(length)
+        stamp_ns=stamp_ns, first_sample=first, sample_period=1e-3, distance=np.zeros(length)
     )
 
 
@@ -42,3 +42,27 @@ def test_the_last_seconds_are_asked_for():
     assert firsts(buffer, 0.15) == [200, 300]
     assert firsts(buffer) == [0, 100, 200, 300]
     assert firsts(BlockBuffer(10), 1.0) == []
+
+
+def test_a_block_that_comes_late_or_again_ends_no_motion():
+    """Its stamp is older, as its counter is; what is asked for last is still the end."""
+    buffer = BlockBuffer(10_000)
+    for first in (0, 100, 300, 400, 100, 200):
+        buffer.add(block(first, stamp_ns=first * 1_000_000))
+    assert firsts(buffer) == [0, 100, 300, 100, 200, 400]
+    assert buffer.forgotten == 0
+    assert firsts(buffer, 0.05) == [400]
+
+
+def test_a_motion_that_begins_soon_after_is_a_new_one():
+    buffer = BlockBuffer(10_000)
+    for first, seconds in ((0, 0.0), (100, 0.1), (0, 0.35)):
+        buffer.add(block(first, stamp_ns=round(seconds * 1e9)))
+    assert firsts(buffer) == [0]
+
+
+def test_a_recording_of_an_earlier_day_is_a_new_motion():
+    buffer = BlockBuffer(10_000)
+    for first, seconds in ((0, 1e5), (100, 1e5 + 0.1), (0, 10.0)):
+        buffer.add(block(first, stamp_ns=round(seconds * 1e9)))
+    assert firsts(buffer) == [0]

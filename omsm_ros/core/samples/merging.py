@@ -1,0 +1,66 @@
+"""Many small blocks as few large ones: a filter's call costs more than a sample.
+
+Whoever falls behind finds more blocks waiting, and catches up by dealing with them at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import TypeVar
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.units import NANOSECONDS_PER_S
+
+B = TypeVar("B", AxisBlock, DistanceBlock)
+
+# Stamps within one block are those of its first sample and the period; they are moved no further.
+_STAMP_TOLERANCE_S = 1e-3
+_NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
+
+
+def merged(blocks: Sequence[B]) -> list[B]:
+    """Return blocks of the same samples in the same order, those joined that follow on.
+
+    Joined are blocks with consecutive counts, one period, the same channels, and stamps that
+    continue the first one's.
+    """
+    runs: list[list[B]] = []
+    length = 0
+    for block in blocks:
+        if runs and _continues(runs[-1][0], length, block):
+            runs[-1].append(block)
+            length += len(block)
+        else:
+            runs.append([block])
+            length = len(block)
+    return [run[0] if len(run) == 1 else _joined(run) for run in runs]
+
+
+def _continues(first: B, length: int, block: B) -> bool:
+    period = first.sample_period
+    if block.first_sample != first.first_sample + length or block.sample_period != period:
+        return False
+    off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
+    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _told(first) == _told(block)
+
+
+def _told(block: B) -> tuple[str, ...]:
+    """Names of the channels that have samples: an empty one means something of its own."""
+    return tuple(name for name in _channels(block) if len(getattr(block, name)))
+
+
+def _channels(block: B) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(block) if f.name not in _NO_CHANNELS)
+
+
+def _joined(run: Sequence[B]) -> B:
+    return replace(
+        run[0],
+        **{
+            name: np.concatenate([getattr(block, name) for block in run])
+            for name in _channels(run[0])
+        },
+    )

@@ -1,0 +1,175 @@
+"""Killed at any moment and started again: right within seconds, and what was lost is told."""
+
+import random
+import signal
+
+import pytest
+from omsm_msgs.msg import AxisBlock, DistanceBlock
+from omsm_msgs.srv import Identify, PredictError
+from std_srvs.srv import Trigger
+
+from omsm_ros.storage import conversions
+from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.twin.cell import blocks_of
+
+pytestmark = pytest.mark.timeout(180)
+
+SCAN = 20_000
+LAPSE = 4.0  # five seconds: as long as a node needs to start twice
+
+
+def start_scanning(cell, calibration):
+    path = cell.folder / "cal.json"
+    save_calibration(path, calibration)
+    cell.start_emulator(time_lapse=LAPSE)
+    cell.start_driver()
+    cell.processes.start("corrector", calibration=str(path))
+    cell.wait(
+        "the nodes",
+        lambda: (
+            cell.operator.value("confocal_driver", "axes_subscribers") >= 1
+            and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
+            and cell.operator.value("confocal_driver", "connections") >= 1
+        ),
+    )
+    assert cell.call(Trigger, "cell_emulator/scan").success
+
+
+def kill_at(cell, node, samples, restart):
+    cell.wait(
+        f"sample {samples}",
+        lambda: cell.operator.value("cell_emulator", "samples_played") >= samples,
+    )
+    cell.processes.end(node, how=signal.SIGKILL)
+    cell.operator._status.pop(node, None)
+    restart()
+    cell.wait(f"the new {node}", lambda: cell.operator.text(node, "lifecycle") == "active")
+
+
+def account_is_closed(cell, stream):
+    status = cell.operator._status["corrector"]
+    prefix = f"{stream}_"
+    counts = {
+        key.removeprefix(prefix): int(value)
+        for key, value in status.items()
+        if key.startswith(prefix)
+    }
+    uncalibrated, refused = counts.pop("uncalibrated"), counts.pop("refused")
+    received = counts.pop("received")
+    assert uncalibrated == refused == 0
+    assert sum(counts.values()) == received
+    return received
+
+
+def seeds(many):
+    """One for each run of the tests, more in the soak."""
+    return [0, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, many))]
+
+
+@pytest.mark.parametrize("seed", seeds(10))
+def test_a_killed_driver_leaves_a_gap_that_is_counted(cell, true_calibration, seed):
+    """corrected + counted reasons + missing are what the emulator sent."""
+    start_scanning(cell, true_calibration)
+    when = random.Random(seed).randrange(1000, SCAN // 3)
+    kill_at(cell, "confocal_driver", when, cell.start_driver)
+    cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= SCAN)
+    for stream in ("axes", "distance"):
+        cell.settle("corrector", f"{stream}_received")
+        received = account_is_closed(cell, stream)
+        missing = cell.operator.value("corrector", f"missing_{stream}")
+        assert missing > 0
+        assert received + missing == SCAN
+    assert cell.operator.value("corrector", "axes_corrected") > 0
+
+
+@pytest.mark.parametrize("seed", seeds(10))
+def test_a_killed_corrector_goes_on_where_it_comes_back(cell, true_calibration, seed):
+    start_scanning(cell, true_calibration)
+    path = str(cell.folder / "cal.json")
+    when = random.Random(seed).randrange(1000, SCAN // 3)
+    kill_at(cell, "corrector", when, lambda: cell.processes.start("corrector", calibration=path))
+    cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= SCAN)
+    cell.settle("corrector", "axes_received")
+    received = {stream: account_is_closed(cell, stream) for stream in ("axes", "distance")}
+    assert min(received.values()) > 0
+    # From its first sample on none is missing; two streams are found a moment apart.
+    assert cell.operator.value("corrector", "missing_axes") == 0
+    assert cell.operator.value("corrector", "missing_distance") == 0
+    assert cell.operator.value("corrector", "axes_corrected") > min(received.values()) - 200
+    assert cell.operator.value("confocal_driver", "delivered") == SCAN
+
+
+def single_samples(cell, count):
+    """Blocks of one sample at 1 kHz to the corrector."""
+    axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
+    messages = conversions.ros_messages()
+    zero = [0.0]
+    common = {"sample_period": 1e-3}
+    made = (
+        AxisBlock(**common, **dict.fromkeys("xybcz", zero)),
+        DistanceBlock(**common, distance=zero),
+    )
+    start = cell.operator.get_clock().now().nanoseconds
+    for k in range(count):
+        due = start + k * 1_000_000
+        while cell.operator.get_clock().now().nanoseconds < due:
+            pass
+        for publisher, message in zip((axes, distance), made, strict=True):
+            message.first_sample = k
+            message.header = conversions.header(messages, due, "")
+            publisher.publish(message)
+
+
+@pytest.mark.parametrize("count", [3000, pytest.param(300_000, marks=pytest.mark.soak)])
+def test_blocks_of_one_sample_are_all_in_the_account(cell, true_calibration, count):
+    path = cell.folder / "cal.json"
+    save_calibration(path, true_calibration)
+    cell.processes.start("corrector", calibration=str(path))
+    single_samples(cell, count)
+    for stream in ("axes", "distance"):
+        cell.settle("corrector", f"{stream}_received")
+        received = account_is_closed(cell, stream)
+        assert received + cell.operator.value("corrector", f"missing_{stream}") == count
+
+
+def test_two_hundred_calls_at_once_are_all_answered(cell, step_test):
+    """The first are worked on, the others are told to come again; no sample waits for them."""
+    cell.processes.start("calibrator", output=str(cell.folder / "new.json"))
+    axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
+    messages = conversions.ros_messages()
+    for pair in blocks_of(step_test):
+        axes.publish(conversions.axis_message(messages, pair[0]))
+        distance.publish(conversions.distance_message(messages, pair[1]))
+    held = len(step_test.axes)
+    cell.wait("all of it", lambda: cell.operator.value("calibrator", "axes_held") == held)
+    client = cell.operator.create_client(Identify, "/omsm/calibrator/identify")
+    assert client.wait_for_service(10.0)
+    cell.settle("calibrator", "axes_held")
+    futures = [client.call_async(Identify.Request(order=99)) for _ in range(100)]
+    futures += [client.call_async(Identify.Request(order=2)) for _ in range(100)]
+    cell.wait("all answers", lambda: all(future.done() for future in futures))
+    answers = [future.result() for future in futures]
+    assert all("order" in answer.message for answer in answers[:100])
+    busy = [answer for answer in answers[100:] if "busy" in answer.message]
+    assert len(busy) >= 80
+    assert sum(answer.success for answer in answers) == 100 - len(busy)
+    assert cell.operator.value("calibrator", "defects") == 0
+
+
+def test_a_prediction_does_not_stop_the_samples(cell, true_calibration, small_scan_blocks):
+    path = cell.folder / "cal.json"
+    save_calibration(path, true_calibration)
+    cell.processes.start("corrector", calibration=str(path))
+    axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
+    messages = conversions.ros_messages()
+    client = cell.operator.create_client(PredictError, "/omsm/corrector/predict_error")
+    assert client.wait_for_service(10.0)
+    z = [1e-6 * (k % 50) for k in range(200_000)]
+    futures = [client.call_async(PredictError.Request(z=z, sample_period=1e-3)) for _ in range(3)]
+    for pair in small_scan_blocks[:100]:
+        axes.publish(conversions.axis_message(messages, pair[0]))
+        distance.publish(conversions.distance_message(messages, pair[1]))
+    sent = sum(len(pair[0]) for pair in small_scan_blocks[:100])
+    cell.wait("all samples", lambda: cell.operator.value("corrector", "distance_received") == sent)
+    cell.wait("all answers", lambda: all(future.done() for future in futures))
+    assert account_is_closed(cell, "axes") == sent
