@@ -10,14 +10,19 @@ from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, form_rows
+from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.surface.freedoms import AUTO
 from omsm_ros.jobs.judge_form import judge_form
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
+from omsm_ros.jobs.show_surface import Scan, show_surface
+from omsm_ros.readable import quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.machine_files import load_limits
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
+from omsm_ros.units import DEGREE_RAD
 
 # ---------------------------------------------------------------------------------- form
 
@@ -53,6 +58,49 @@ def _form(args: argparse.Namespace) -> Facts:
         return judge_form(points, surface, out, args.fit, args.aperture, filters)
 
 
+# ------------------------------------------------------------------------------- surface
+
+
+def _declare_surface(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("what", choices=("show",), help="show: extent, slopes, and who can follow")
+    sub.add_argument("surface", type=Path, metavar="SURFACE.yaml")
+    radius, speed = number(quantities.STEP), number(quantities.SPEED)
+    sub.add_argument("--radius", type=radius, required=True, help="of the disc [m]")
+    sub.add_argument("--feed", type=radius, default=1e-4, help="of the spiral, a turn [m]")
+    sub.add_argument("--speed", type=speed, default=30.0, help="of the spindle [rpm]")
+    sub.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="as of omsm predict")
+    sub.add_argument(
+        "--probe-angle", type=number(quantities.TURN), help="to the normal, at which it reads [rad]"
+    )
+    sub.add_argument("--out", type=Path, metavar="DIR", help="for a picture")
+
+
+def _surface(args: argparse.Namespace) -> Facts:
+    limits = load_limits(args.limits) if args.limits else MachineLimits()
+    scan = Scan(args.radius, args.feed, args.speed)
+    facts = show_surface(load_surface(args.surface), scan, limits, args.probe_angle, args.out)
+    return {"surface": str(args.surface), **facts}
+
+
+_FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
+
+
+def _show_surface(facts: Facts) -> None:
+    x, y = (quantity(part, "m") for part in facts["steepest_at"])
+    angle = f"{facts['steepest_angle'] / DEGREE_RAD:.3g}°"
+    table(
+        [
+            ("peak to valley", quantity(facts["peak_to_valley"], "m")),
+            ("steepest", f"{angle} at x = {x}, y = {y}"),
+            ("probe", _FOLLOWS[facts["probe_can_follow"]]),
+            ("axes", _FOLLOWS[facts["axes_can_follow"]]),
+            *((f"  {limit['name']}", f"{limit['value']:.3g} of {limit['allowed']:.3g} "
+               f"{limit['unit']}") for limit in facts["limits"]),
+            ("not evaluated", ", ".join(facts["not_evaluated"])),
+        ]
+    )  # fmt: skip
+
+
 COMMANDS = (
     Command(
         "form",
@@ -60,5 +108,12 @@ COMMANDS = (
         _declare_form,
         _form,
         lambda facts: table(form_rows(facts)),
+    ),
+    Command(
+        "surface",
+        "what a nominal surface asks of probe and axes",
+        _declare_surface,
+        _surface,
+        _show_surface,
     ),
 )

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.surface.height_grid import GridSurface, as_grid
 from omsm_ros.core.surface.nominal import SHAPES
 from omsm_ros.core.surface.posed import Pose, PosedSurface
-from omsm_ros.errors import ConfigurationError, SurfaceError
+from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceError
 from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text
+from omsm_ros.storage.maps.length_units import units_of
+from omsm_ros.storage.maps.read_map import read_points
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 
 MAX_YAML_BYTES = 100_000
+_GRID = "grid"
 _INTEGER: Mapping[str, Any] = {"type": "integer"}
 _LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
 
@@ -31,19 +35,40 @@ def load_surface(path: Path | str) -> Surface:
     """Read ``SURFACE.yaml``; SurfaceError if it is malformed."""
     text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
     what = f"surface {str(path)!r}"
-    return surface_of(strict_yaml.mapping_of(text, SurfaceError, what), what)
+    return surface_of(strict_yaml.mapping_of(text, SurfaceError, what), what, Path(path).parent)
 
 
-def surface_of(description: Mapping[str, Any], what: str) -> Surface:
-    """Return the surface of a description, which messages call ``what``."""
+def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = None) -> Surface:
+    """Return the surface of a description, which messages call ``what``.
+
+    folder: where the files that it names are sought; None: it may name none
+    """
     values = dict(description)
     shape, pose = values.pop("shape", None), values.pop("pose", None)
     named = {"shape": shape} if shape is not None else {}
-    check_form(named, form({"shape": {"enum": sorted(SHAPES)}}, ("shape",)), SurfaceError, what)
-    surface: Surface = _record(SHAPES[shape], values, f"{what}: {shape}")
+    known = sorted([*SHAPES, *([_GRID] if folder is not None else [])])
+    check_form(named, form({"shape": {"enum": known}}, ("shape",)), SurfaceError, what)
+    if shape == _GRID:
+        surface = _grid(values, f"{what}: {shape}", folder or Path())
+    else:
+        surface = _record(SHAPES[shape], values, f"{what}: {shape}")
     if pose is None:
         return surface
     return PosedSurface(surface, _value(Pose, pose, f"{what}: pose"))
+
+
+def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
+    """Return the surface of a map in a file of any known format."""
+    schema = form({"file": {"type": "string"}, "unit": {"type": "string"}}, ("file",))
+    check_form(values, schema, SurfaceError, what)
+    try:
+        units = units_of(values["unit"]) if "unit" in values else None
+        grid = as_grid(read_points(folder / values["file"], units))
+        if grid is None:
+            raise DataError("its points are no evenly spaced rows and columns")
+        return GridSurface(grid)
+    except (FileError, DataError) as err:
+        raise SurfaceError(f"{what}: {err}") from err
 
 
 def _record(kind: Any, values: Mapping[str, Any], what: str) -> Any:

@@ -5,6 +5,7 @@ import pytest
 
 from omsm_ros.core.surface.aspheres import Asphere
 from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
+from omsm_ros.core.surface.height_grid import GridSurface, HeightGrid
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, SHAPES
 from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
 from omsm_ros.errors import SurfaceError
@@ -76,3 +77,48 @@ def test_every_shape_has_a_schema():
         with pytest.raises(SurfaceError, match="no_such"):
             surface_file.surface_of({"shape": name, "no_such": 1}, "it")
         assert kind.__doc__
+
+
+def test_a_map_is_a_surface(tmp_path):
+    """Through text in millimetres; between its places to the fourth order of their spacing."""
+    line = np.linspace(-10, 10, 81)
+    x, y = (v.ravel() for v in np.meshgrid(line, line))
+    height = 1e3 * PAPER_MIRROR.height(x * 1e-3, y * 1e-3)
+    np.savetxt(tmp_path / "sag.xyz", np.stack([x, y, height], axis=1), fmt="%.12g")
+    path = tmp_path / "surface.yaml"
+    path.write_text("shape: grid\nfile: sag.xyz\nunit: mm\npose: {piston: 1.0e-3}\n")
+    surface = load_surface(path)
+    u, v = np.random.default_rng(1).uniform(-9e-3, 9e-3, (2, 500))
+    np.testing.assert_allclose(surface.height(u, v) - 1e-3, PAPER_MIRROR.height(u, v), atol=1e-12)
+    for one, other in zip(surface.gradient(u, v), PAPER_MIRROR.gradient(u, v), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8)
+    assert np.isnan(surface.height(np.array([0.02]), np.zeros(1)))
+
+
+def test_a_hole_in_a_map_is_a_hole_in_the_surface():
+    line = np.linspace(-1.0, 1.0, 21)
+    height = np.add.outer(line**2, line)
+    height[5, 5] = np.nan
+    surface = GridSurface(HeightGrid(height=height, x0=-1.0, y0=-1.0, dx=0.1, dy=0.1))
+    u = np.array([-0.46, -0.74, 0.43])
+    found = surface.height(u, np.array([-0.52, -0.52, 0.2]))
+    assert np.isnan(found[0])
+    np.testing.assert_allclose(found[1:], [-0.74 + 0.52**2, 0.43 + 0.04], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("shape: grid\n", "file is required"),
+        ("shape: grid\nfile: none.xyz\n", "none.xyz"),
+        ("shape: grid\nfile: points.xyz\nunit: mm\n", "no evenly spaced rows"),
+        ("shape: grid\nfile: points.xyz\nunit: cubit\n", "cubit"),
+        ("shape: sum\nparts: [{shape: grid, file: a}]\n", "grid.*expected one of"),
+    ],
+)
+def test_what_is_no_map_is_refused(text, named, tmp_path):
+    np.savetxt(tmp_path / "points.xyz", np.random.default_rng(1).uniform(0, 1, (50, 3)))
+    path = tmp_path / "surface.yaml"
+    path.write_text(text)
+    with pytest.raises(SurfaceError, match=named):
+        load_surface(path)

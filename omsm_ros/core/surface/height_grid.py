@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import DataError
 
@@ -88,3 +88,63 @@ def _levels(values: FloatArray) -> tuple[IntArray, float, float] | None:
     if float(np.max(np.abs(level - number))) > _LARGEST_STRAY:
         return None
     return number.astype(np.int64), least, step
+
+
+class GridSurface:
+    """A map as a nominal surface, between its places by cubic splines.
+
+    It has no height beyond its edges, nor where one of the four places around is missing. Raises
+    DataError for a map of fewer than four rows or columns.
+    """
+
+    def __init__(self, grid: HeightGrid) -> None:
+        from scipy.interpolate import RectBivariateSpline  # takes a third of a second to load
+
+        if min(grid.height.shape) < 4:
+            raise DataError(f"map of shape {grid.height.shape!r}, expected 4 rows and columns")
+        self._grid, self._known = grid, np.isfinite(grid.height)
+        # Only cells whose places are all known are used; the others must not bend these.
+        filled = np.where(self._known, grid.height, _beside(grid.height))
+        self._spline = RectBivariateSpline(grid.y, grid.x, filled)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height [m] at x, y [m]; NaN where the map has none."""
+        return self._at(x, y, 0, 0)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        return self._at(x, y, 1, 0), self._at(x, y, 0, 1)
+
+    def _at(self, x: FloatArray, y: FloatArray, dx: int, dy: int) -> FloatArray:
+        across, along = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y))
+        known = self._measured(across, along)
+        places = (np.where(known, v, start) for v, start in
+                  ((along, self._grid.y0), (across, self._grid.x0)))  # fmt: skip
+        return np.where(known, self._spline.ev(*places, dx=dy, dy=dx), np.nan)
+
+    def _measured(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return where the four places around are all known."""
+        grid, slack = self._grid, 1e-9
+        column, row = (x - grid.x0) / grid.dx, (y - grid.y0) / grid.dy
+        rows, columns = grid.height.shape
+        inside = np.isfinite(column) & np.isfinite(row)
+        for place, count in ((column, columns), (row, rows)):
+            inside = inside & (place >= -slack) & (place <= count - 1 + slack)
+        left, low = (
+            np.clip(np.where(inside, place, 0).astype(np.int64), 0, count - 2)
+            for place, count in ((column, columns), (row, rows))
+        )
+        whole = self._known[:-1] & self._known[1:]
+        whole = whole[:, :-1] & whole[:, 1:]
+        return np.asarray(inside & whole[low, left])
+
+
+def _beside(height: FloatArray) -> FloatArray:
+    """Return the map with each missing place as the nearest known one of its row, else the mean."""
+    made = np.full_like(height, np.nanmean(height))
+    index = np.arange(height.shape[1])
+    for row, values in enumerate(height):
+        known = np.isfinite(values)
+        if np.any(known):
+            made[row] = np.interp(index, index[known], values[known])
+    return made
