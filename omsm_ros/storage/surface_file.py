@@ -21,8 +21,6 @@ from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceErr
 from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text
-from omsm_ros.storage.maps.length_units import units_of
-from omsm_ros.storage.maps.read_map import read_points
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 
 MAX_YAML_BYTES = 100_000
@@ -59,6 +57,10 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
     """Return the surface of a map in a file of any known format."""
+    # Here, because readers of maps take longer to load than a scan to correct.
+    from omsm_ros.storage.maps.length_units import units_of
+    from omsm_ros.storage.maps.read_map import read_points
+
     schema = form({"file": {"type": "string"}, "unit": {"type": "string"}}, ("file",))
     check_form(values, schema, SurfaceError, what)
     try:
