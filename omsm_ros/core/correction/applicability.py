@@ -14,7 +14,9 @@ import numpy as np
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.errors import CalibrationError
 
+# Quartz clocks agree to some 1e-5; a rate is written, not measured, and differs by rounding alone.
 SAME_RATE = 1e-6
+# Settings are written by people or read back as float32.
 _SAME_VALUE = 1e-6
 
 

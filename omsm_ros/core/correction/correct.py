@@ -38,6 +38,7 @@ from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
 
+# A period is written, not measured: it differs by rounding alone.
 SAME_PERIOD = 1e-6
 
 

@@ -27,9 +27,11 @@ VIBRATION, DRIFT = "vibration", "drift"
 
 # Below this a relaxation is no slower than the structure itself.
 FASTEST_CREEP_S = 20e-3
+# Neighbours a factor of 1.6 apart look the same within a few per cent; so few are tried.
 _CREEPS_A_DECADE = 5
 # A line of damping ζ is 2ζ wide, and so far apart are neighbours.
 _DAMPINGS = (0.03, 0.15)
+# Faster modes are poles of the structure, which the choice of order finds.
 _FASTEST_MODE_HZ = 100.0
 # Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
 _SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
@@ -37,8 +39,11 @@ _SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
 _FINER = 8
 # A motion crosses any of them in about a sample, so few do.
 _GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
+# Of a period in the travel: 98 µm in steps make 1 µm, a fringe of a scale or of an interferometer.
 _MOST_CYCLES = 100
+# Of Legendre polynomials: from a bend to what wanders eight times over the record.
 _DRIFT_DEGREES = (2, 3, 4, 6, 8)
+# Of vibration at a time: the next round looks for more.
 _LINES_TRIED = 3
 
 

@@ -17,6 +17,7 @@ from omsm_ros.core.fitting.steps import Steps
 FALSE_ALARM = 1e-4
 # Of the rate of the motion, as the residual may follow it.
 _LAGS = 25
+# A lagged rate weaker than this part of the strongest is rounding.
 _ABOVE_ROUNDING = 1e-6
 
 

@@ -16,6 +16,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunct
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 
+# A window of ten per cent fades six samples at either end.
 MIN_SAMPLES = 64
 # Share of the record that the window fades at either end.
 _FADE = 0.1

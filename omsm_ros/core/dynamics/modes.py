@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 
+# Evenly up to the highest frequency: the terms are compared with the response at each.
 _LINES = 400
 
 

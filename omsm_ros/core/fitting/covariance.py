@@ -11,6 +11,7 @@ from omsm_ros.core.fitting.uneven_noise import uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.least_squares import unit_columns
 
+# Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
 # Directions of the parameter space this much weaker than the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11

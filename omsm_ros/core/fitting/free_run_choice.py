@@ -22,6 +22,7 @@ from omsm_ros.core.fitting.output_error import Fit, fit
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 
+# As many as the table of quantities lets a user ask for.
 MAX_ORDER = 20
 # Parts of the used samples; all but the first are hidden once, and the last three together.
 _PARTS = 6

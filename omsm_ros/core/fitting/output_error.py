@@ -24,13 +24,21 @@ from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.least_squares import least_squares
 
+# A linear column weaker than this part of the strongest is rounding.
 _RANK_TOLERANCE = 1e-12
+# Of each start: two serve step tests, held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
+# A bound for fits that creep along a valley; others end by convergence before.
 _FINISH_EVALUATIONS = 60
+# Madsen, Nielsen and Tingleff (2004) advise it where the start is no more than fair.
 _FIRST_DAMPING = 1e-3
+# A parameter that changes the output this much less than another is not identifiable.
 _INSENSITIVE = 1e-10
+# Relative to 1 + |ψ|: smaller ones change no digit of a coefficient that is printed.
 _SMALLEST_STEP = 1e-9
+# In ψ, the logarithm of a coefficient: a factor of twenty, beyond which no quadratic model holds.
 _LONGEST_STEP = 3.0
+# Of what one parameter gains by chance.
 _CONVERGED = 1e-4
 # The pulse before a record has this content left, as a power of e, where its band ends.
 _PULSE_END = 14.0

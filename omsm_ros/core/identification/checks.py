@@ -21,6 +21,7 @@ from omsm_ros.readable import percent, plain, quantity
 _WORST_CHI_SQUARE = 1.3
 # A rest this much noisier than the motion is no measure of noise: something still rings.
 _LEAST_CHI_SQUARE = 0.3
+# Three times the highest content of the paper's scan, 1.5 Hz: with less there is no use for it.
 _LEAST_TRUSTED_HZ = 5.0
 
 

@@ -33,6 +33,7 @@ from omsm_ros.readable import chance, plain, quantity
 
 # No benign one of a hundred test records (noise, hum, drift, dropouts) comes above it.
 _WORST_AGREEMENT = 2.5
+# Resolves 1 Hz.
 _AGREEMENT_SEGMENT_S = 1.0
 _LEAST_SEGMENTS = 8
 # Share of its size that a departure costs on a scan, as a standard uncertainty: backlash and

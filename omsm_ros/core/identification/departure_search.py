@@ -32,6 +32,7 @@ from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.identification.model_choice import Model
 
+# Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
 _BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Their columns follow the fitted response, which they improve.

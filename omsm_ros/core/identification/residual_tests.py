@@ -20,9 +20,11 @@ from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import orthonormal
 
+# As resid of the System Identification Toolbox takes.
 _LAGS = 25
 # After an edge the response is looked at for this long.
 _AFTER_EDGE_S = 50e-3
+# Then a standard deviation is known to a twentieth.
 _LEAST_REST_SAMPLES = 200
 # No probe tells less; a misfit below it is none.
 _FINEST_READING_M = 1e-10

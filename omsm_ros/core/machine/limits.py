@@ -31,6 +31,7 @@ _CONTENT_SHARE = 0.999
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
 # so many samples, so that the encoder's noise stays below the path.
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
+# As for the corrector: a parabola through the first samples is the past.
 _START_SAMPLES = 12
 
 _DECLARED = Quantity("limit", "", 1e-12, 1e12, "give it in the unit of its name")

@@ -36,6 +36,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError
 
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
+# On a logarithmic grid over three decades: neighbours 2 % apart.
 _FREQUENCIES = 400
 
 

@@ -24,8 +24,11 @@ from omsm_ros.least_squares import least_squares, unit_columns
 from omsm_ros.units import MICROMETRE_M
 
 _COLUMNS = ("x", "y", "z", "b", "c", "distance")
+# Ten groups of consecutive points, whose scatter is then known to a quarter.
 _MIN_POINTS = 1000
+# Thinned evenly to so many: time and memory of the fit stay bounded.
 _MAX_POINTS = 60_000
+# Consecutive points within which residuals may be correlated: 0.1 s at 1 kHz.
 _GROUP_POINTS = 100
 # Unknowns are fitted in these units: micrometres for lengths, milliradians for slopes.
 _SLOPE_UNIT = 1e-3

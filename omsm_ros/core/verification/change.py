@@ -20,6 +20,7 @@ from omsm_ros.errors import CalibrationError
 from omsm_ros.readable import chance, quantity
 from omsm_ros.units import PPM
 
+# Evenly over the common band; covariances have fewer independent directions than that.
 _LINES = 30
 # One in a thousand comparisons of an unchanged machine calls it changed.
 SIGNIFICANCE = 1e-3

@@ -39,6 +39,7 @@ DEFAULT_CLOCKING_RAD = 5e-7
 # A part that stays on the chuck moves by warming alone; on an off-axis paraboloid a shift and
 # a tilt together look like clocking, so what is allowed here limits what can be told.
 DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
+# A prior as wide as this is none, yet the matrix stays regular.
 _FREE = 1e6
 # Where the noise is looked for; the residuals tell it after one step.
 _NOISE_M = 10e-9

@@ -289,3 +289,7 @@ class TestStatedSources:
     def test_nonsense_is_refused_by_name(self, true_calibration, stated, named):
         with pytest.raises(ConfigurationError, match=named):
             sources_with(true_calibration, stated)
+
+
+def test_what_nobody_stated_is_no_source():
+    assert all(getattr(ErrorSources(), field.name) == 0.0 for field in fields(ErrorSources))
