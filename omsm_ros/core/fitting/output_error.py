@@ -26,7 +26,7 @@ from omsm_ros.least_squares import least_squares
 
 # A linear column weaker than this part of the strongest is rounding.
 _RANK_TOLERANCE = 1e-12
-# Of each start: two serve step tests, held inputs need five (docs/design/identification-ablation.md).
+# Of each start; held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
 # A bound for fits that creep along a valley; others end by convergence before.
 _FINISH_EVALUATIONS = 60
