@@ -19,6 +19,7 @@ NODES = (
     "accelerometer_driver",
     "vibration_monitor",
     "recorder",
+    "player",
     "cell_emulator",
     "cell_demo",
 )
@@ -61,6 +62,7 @@ setup(
     entry_points={
         "console_scripts": [
             *(f"{node} = {PACKAGE}.nodes.{node}_node:main" for node in NODES),
+            f"replay = {PACKAGE}.nodes.player_node:main",
             f"omsm = {PACKAGE}.cli:main",
         ]
     },

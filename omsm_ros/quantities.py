@@ -200,6 +200,9 @@ BUFFER_SAMPLES = Quantity(
 COUNT = Quantity("count", "", 1, 100_000, "give a smaller number", whole=True)
 PROCESSES = Quantity("processes", "", 1, 1024, "one a core serves best", whole=True)
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
+PLAY_RATE = Quantity("rate of playing", "", 0.0, 1e4, "1 = as recorded, 0 = as fast as can be")
+PLAY_TIME = Quantity("time within a recording", "s", 0.0, 1e8, "give it in seconds")
+LISTENERS = Quantity("listeners", "", 0, 1000, "0 = begin at once", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.
 SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")

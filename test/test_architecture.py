@@ -55,6 +55,7 @@ ONLY_IN = {
     "diagnostic_msgs": {"nodes"},
     "builtin_interfaces": {"nodes", "storage.conversions"},
     "rcl_interfaces": {"nodes"},
+    "rosgraph_msgs": {"nodes"},
     "lifecycle_msgs": {"nodes"},
     "tf2_msgs": {"nodes"},
     "geometry_msgs": {"nodes"},

@@ -32,7 +32,7 @@ def motion_of_bag(
     faster = TIME_LAPSE.checked(time_lapse, ConfigurationError, "time_lapse")
     topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
     with bags.BagReader(path) as bag:
-        if any(t.topic == bags.REFERENCE_TOPIC and t.messages for t in bag.topics()):
+        if any(t.role == bags.REFERENCE_TOPIC and t.messages for t in bag.topics()):
             topics.append(bags.REFERENCE_TOPIC)
     blocks = read_blocks(path, topics, progress)
     if not blocks[bags.AXES_TOPIC] or not blocks[bags.DISTANCE_TOPIC]:

@@ -42,7 +42,7 @@ def path_in(path: Path, progress: Progress = no_progress) -> ScanPath:
     start = PathStart(MOST_JUDGED)
     with bags.BagReader(path) as bag:
         wanted = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
-        present = [t.topic for t in bag.topics() if t.messages and t.topic in wanted]
+        present = [t.role for t in bag.topics() if t.messages and t.role in wanted]
         total = bag.count(present)
         for done, _, block in bag.blocks(*present):
             start.add(block)

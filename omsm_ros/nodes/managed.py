@@ -20,6 +20,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes import topics
@@ -58,6 +59,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._declared = Declared(self, (*parameters, AUTOSTART), self._keeps_parameters)
         self._answer_impossible_transitions()
         self.diagnostics = Diagnostics(self, self._report, self.hardware_id)
+        self.create_service(Trigger, f"~/{topics.TAKEN}", topics.tell_taken)
 
     # --- what a node fills in
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, TypeAlias
@@ -12,6 +13,9 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
+
+from omsm_ros.storage import strict_json
 
 MessageInfo: TypeAlias = "dict[str, int]"
 
@@ -36,6 +40,11 @@ LATCHED_BY_MANY_QOS = QoSProfile(
 )
 # Requests wait for their turn while a node computes; ten, the usual depth, are soon lost.
 REQUESTS_QOS = QoSProfile(depth=1000)
+
+TAKEN = "taken"
+"""Service of every node, below its name: how many messages it has taken of each topic, as JSON."""
+
+_taken: Counter[str] = Counter()
 
 # At most so many messages are taken in a row, so that timers and services have their turn.
 _BULK = 500
@@ -70,9 +79,13 @@ def listen(
     taken in one.
     """
 
-    def take_all(message: Any, info: MessageInfo) -> None:
+    def take(message: Any, info: MessageInfo) -> None:
         callback(message, info)
-        take_waiting(made, callback)
+        _taken[made.topic_name] += 1
+
+    def take_all(message: Any, info: MessageInfo) -> None:
+        take(message, info)
+        take_waiting(made, take)
         after()
 
     events = SubscriptionEventCallbacks(
@@ -100,6 +113,12 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
             return count
         callback(*taken)
     return _BULK
+
+
+def tell_taken(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    """Answer how many messages of each topic this process has dealt with."""
+    response.success, response.message = True, strict_json.text_of(dict(_taken))
+    return response
 
 
 def _overriding() -> QoSOverridingOptions:

@@ -39,6 +39,7 @@ from omsm_ros.storage.recording.topics import (
     POINTS_TOPIC,
     REFERENCE_TOPIC,
     TOPIC_TYPES,
+    CellBag,
 )
 
 _TO_RECORD: dict[str, Callable[[Any], Any]] = {
@@ -61,6 +62,7 @@ _BLOCKS: dict[str, type] = {
 # at 8 MB, 2.7 s at 16 MB).
 _JOINED_BYTES = 8_000_000
 
+AnyBag: TypeAlias = "Path | str | CellBag"
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
 
 
@@ -69,21 +71,27 @@ Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | An
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """What a bag holds on one topic."""
+    """What a bag holds on one topic.
+
+    topic: its name there;  role: the topic of the contract that it is, empty if none
+    """
 
     topic: str
     type: str
     messages: int
+    role: str = ""
 
 
 class BagReader:
     """A bag opened for reading; use it as a context manager.
 
+    Topics are asked for by their names of the contract, whatever the bag calls them.
     Raises BagError if the path is missing, no bag, or cut short.
     """
 
-    def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+    def __init__(self, bag: AnyBag) -> None:
+        self._cell = bag if isinstance(bag, CellBag) else CellBag(Path(bag))
+        self.path = self._cell.path
 
     def __enter__(self) -> BagReader:
         whole = (
@@ -97,6 +105,8 @@ class BagReader:
             self._reader = opening.enter_context(Reader(self.path))
             check_index(self.path, self._reader)
             check_checksums(self.path)
+            held = {c.topic: c.msgtype for c in self._reader.connections}
+            self._names = self._cell.names(held)
             self._stack = opening.pop_all()
         self._compressed = self._reader.compression_mode == "message"
         if self._compressed:
@@ -118,7 +128,11 @@ class BagReader:
         counts: Counter[tuple[str, str]] = Counter()
         for connection in self._reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
-        return [TopicSummary(*names, count) for names, count in sorted(counts.items())]
+        roles = {name: topic for topic, name in self._names.items()}
+        return [
+            TopicSummary(name, kind, count, roles.get(name, ""))
+            for (name, kind), count in sorted(counts.items())
+        ]
 
     @property
     def start_ns(self) -> int:
@@ -127,7 +141,19 @@ class BagReader:
 
     def count(self, topics: Sequence[str]) -> int:
         """Number of messages on ``topics``."""
-        return sum(t.messages for t in self.topics() if t.topic in topics)
+        return sum(t.messages for t in self.topics() if t.role in topics)
+
+    def messages(
+        self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Yield ``(topic, when it was recorded, serialised message)`` in that order [ns].
+
+        start_ns, stop_ns: the first instant, and the first that is left out
+        """
+        connections = [c for topic in topics for c in self._connections(topic)]
+        roles = self._roles(topics)
+        for connection, stamp, raw in self._raw(connections, start_ns, stop_ns):
+            yield roles[connection.topic], stamp, raw
 
     def records(self, *topics: str) -> Iterator[Item]:
         """Yield ``(topic, record)`` in the order of recording.
@@ -135,8 +161,10 @@ class BagReader:
         Raises BagError if one of ``topics`` is absent, of another type, or malformed.
         """
         connections = [c for topic in topics for c in self._connections(topic)]
-        for connection, raw in self._raw(connections):
-            yield connection.topic, self._record(connection.topic, raw)
+        roles = self._roles(topics)
+        for connection, _, raw in self._raw(connections):
+            topic = roles[connection.topic]
+            yield topic, self._record(topic, raw)
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
         """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.
@@ -146,8 +174,9 @@ class BagReader:
         connections = [c for topic in topics for c in self._connections(topic)]
         waiting: dict[str, list[bytes]] = {}
         size = read = 0
-        for connection, raw in self._raw(connections):
-            waiting.setdefault(connection.topic, []).append(raw)
+        roles = self._roles(topics)
+        for connection, _, raw in self._raw(connections):
+            waiting.setdefault(roles[connection.topic], []).append(raw)
             size, read = size + len(raw), read + 1
             if size >= _JOINED_BYTES:
                 yield from ((read, *item) for item in self._joined(waiting))
@@ -178,32 +207,42 @@ class BagReader:
         except (DataError, CalibrationError) as err:
             raise BagError(f"bag {str(self.path)!r} holds a malformed message: {err}") from err
 
-    def _raw(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, bytes]]:
-        """Serialised messages, as many as the bag promises."""
+    def _raw(
+        self,
+        connections: Sequence[Connection],
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Serialised messages; all of them must be as many as the bag promises."""
         promised = sum(connection.msgcount for connection in connections)
         with translated(self.path, DAMAGED):
-            for connection, _, raw in self._reader.messages(connections) if connections else ():
-                promised -= 1
-                yield connection, unpacked_message(raw) if self._compressed else raw
-        if promised:
+            if connections:
+                for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
+                    promised -= 1
+                    yield connection, stamp, unpacked_message(raw) if self._compressed else raw
+        if promised and start_ns is None and stop_ns is None:
             more_or_less = "fewer" if promised > 0 else "more"
             raise BagError(
                 f"bag {str(self.path)!r} holds {abs(promised)} messages {more_or_less} than its "
                 f"index says: {DAMAGED}"
             )
 
+    def _roles(self, topics: Sequence[str]) -> dict[str, str]:
+        return {self._names[topic]: topic for topic in topics}
+
     def _connections(self, topic: str) -> list[Connection]:
-        found = [c for c in self._reader.connections if c.topic == topic]
+        name = self._names[topic]
+        found = [c for c in self._reader.connections if c.topic == name]
         if not found:
             held = ", ".join(t.topic for t in self.topics()) or "nothing"
             raise BagError(
-                f"{str(self.path)!r} has no topic {topic!r}; it holds {held:.500}. "
-                "Record the raw topics of the cell"
+                f"{str(self.path)!r} has no topic {name!r}; it holds {held:.500}. "
+                "Record the raw topics of the cell, or name them with --namespace or --topics"
             )
         for connection in found:
             if connection.msgtype != TOPIC_TYPES[topic]:
                 raise BagError(
-                    f"{topic!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
+                    f"{name!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
                     f"{TOPIC_TYPES[topic]!r}; record the topics of the cell"
                 )
             with translated(self.path, DAMAGED):

@@ -1,0 +1,56 @@
+"""A recording played to a corrector; ends when all of it is corrected (needs the full ROS 2).
+
+ros2 launch omsm_ros replay.launch.py bag:=scan.mcap calibration:=cal.json [rate:=0]
+"""
+
+from __future__ import annotations
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
+from launch.event_handlers import OnProcessExit
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+ARGUMENTS = {
+    "bag": (None, "the .mcap file or rosbag2 folder to play"),
+    "calibration": ("", "calibration file; empty takes the one that the bag holds"),
+    "rate": ("1.0", "seconds of the bag a second; 0 = no faster than the corrector takes it"),
+    "cell": ("", "namespace of the cell in the bag; empty = the only one"),
+    "namespace": ("/replay", "where to play it: apart from a live cell"),
+}
+
+
+def _text(name: str) -> ParameterValue:
+    return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Player and corrector in a namespace of their own; the end of the player ends both."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=described)
+        for name, (default, described) in ARGUMENTS.items()
+    ]
+    namespace = LaunchConfiguration("namespace")
+    corrector = Node(
+        package="omsm_ros",
+        executable="corrector",
+        namespace=namespace,
+        parameters=[{"calibration": _text("calibration")}],
+        output="screen",
+    )
+    player = Node(
+        package="omsm_ros",
+        executable="replay",
+        namespace=namespace,
+        parameters=[
+            {
+                "bag": _text("bag"),
+                "cell": _text("cell"),
+                "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
+            }
+        ],
+        output="screen",
+    )
+    end = OnProcessExit(target_action=player, on_exit=[Shutdown(reason="all of it was played")])
+    return LaunchDescription([*declared, corrector, player, RegisterEventHandler(end)])

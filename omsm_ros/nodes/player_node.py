@@ -1,0 +1,255 @@
+"""``replay``: plays a bag to the nodes of a cell, as it was or as fast as they can take it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from builtin_interfaces.msg import Time
+from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
+from rclpy.clock import Clock, ClockType
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+
+from omsm_ros import quantities
+from omsm_ros.core.samples.playback import Playback
+from omsm_ros.errors import BagError, ConfigurationError, OmsmError
+from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
+from omsm_ros.nodes.listeners import Listeners
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run, serve
+from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, publish_on
+from omsm_ros.parameters import Parameter
+from omsm_ros.storage.bags import BagReader
+from omsm_ros.storage.recording import topics
+from omsm_ros.storage.recording.topics import CellBag, relative
+from omsm_ros.units import NANOSECONDS_PER_S
+
+PARAMETERS = (
+    Parameter("bag", "", ".mcap file or rosbag2 folder to play", required=True),
+    Parameter("cell", "", "namespace of the cell in the bag, e.g. /cell2; empty = the only one"),
+    Parameter("topics", "", "what to play, e.g. 'axes confocal'; empty = all but points"),
+    Parameter("rate", 1.0, "seconds of the bag a second; 0 = no faster than all take it",
+              quantities.PLAY_RATE),
+    Parameter("start", 0.0, "seconds of the bag to pass over", quantities.PLAY_TIME),
+    Parameter("duration", 0.0, "seconds of the bag to play; 0 = to its end", quantities.PLAY_TIME),
+    Parameter("loop", False, "begin again at the end"),
+    Parameter("paused", False, "wait for ~/resume or ~/step"),
+    Parameter("clock", False, "publish the time of the bag on /clock"),
+    Parameter("listeners", 1, "begin when so many nodes listen to each of axes and confocal",
+              quantities.LISTENERS),
+)  # fmt: skip
+RECORDED_POINTS = "recorded/points"
+"""Where recorded points go if they are asked for: never among those that are corrected now."""
+
+_TYPES = {
+    topics.AXES_TOPIC: AxisBlock,
+    topics.DISTANCE_TOPIC: DistanceBlock,
+    topics.REFERENCE_TOPIC: DistanceBlock,
+    topics.CALIBRATION_TOPIC: Calibration,
+    topics.POINTS_TOPIC: PointCloud2,
+}
+_NEEDED = (topics.AXES_TOPIC, topics.DISTANCE_TOPIC)
+_SAMPLES = (*_NEEDED, topics.REFERENCE_TOPIC)
+_TICK_S = 0.005
+_LATE_S = 1.0
+
+
+class PlayerNode(ManagedNode):
+    """Publishes recorded messages byte for byte; ends when all who listen have taken the last."""
+
+    def __init__(self) -> None:
+        super().__init__("player", PARAMETERS)
+
+    def hardware_id(self) -> str:
+        """Return the bag's path."""
+        return str(self.values.get("bag", ""))
+
+    def configure(self, undo: ExitStack) -> None:
+        """Open the bag, and offer its topics."""
+        path = CellBag(Path(self.values["bag"]), self.values["cell"])
+        self._bag = undo.enter_context(BagReader(path))
+        self._topics = self._asked_for()
+        begin = self._bag.start_ns + round(self.values["start"] * NANOSECONDS_PER_S)
+        length = round(self.values["duration"] * NANOSECONDS_PER_S)
+        self._span = begin, begin + length if length else None
+        self._offers = {topic: self._publisher(undo, topic) for topic in self._topics}
+        self._counts = dict.fromkeys(self._topics, 0)
+        self._position_ns = begin
+        self._obstacle = ""
+
+    def _asked_for(self) -> list[str]:
+        held = [t.role for t in self._bag.topics() if t.role in _TYPES and t.messages]
+        names = self.values["topics"].split() or [
+            relative(topic) for topic in held if topic != topics.POINTS_TOPIC
+        ]
+        found = [topic for topic in held if relative(topic) in names]
+        if unknown := set(names) - {relative(topic) for topic in found} or not found:
+            raise ConfigurationError(
+                f"nothing to play on {unknown!r}; {self.values['bag']!r} has "
+                f"{[relative(topic) for topic in held]!r} of this cell"
+            )
+        return found
+
+    def _publisher(self, undo: ExitStack, topic: str) -> Publisher:
+        name = RECORDED_POINTS if topic == topics.POINTS_TOPIC else relative(topic)
+        if topic in topics.LATCHED_TOPICS:  # others may tell it too: the newest is in force
+            return publish_on(self, undo, _TYPES[topic], name, LATCHED_QOS)
+        return self.publish_on(undo, _TYPES[topic], name, SAMPLES_QOS)
+
+    def activate(self, undo: ExitStack) -> None:
+        """Play."""
+        # What is latched cannot be missed, and others may tell it, too.
+        streams = [p for topic, p in self._offers.items() if topic not in topics.LATCHED_TOPICS]
+        self._listeners = Listeners(self, streams, undo)
+        self._time = (
+            publish_on(self, undo, ClockMessage, "/clock") if self.values["clock"] else None
+        )
+        self._begin()
+        self._begun, self._wanted, self._late = False, not self.values["paused"], 0.0
+        for name, answer in (
+            ("pause", self._on_pause), ("resume", self._on_resume), ("step", self._on_step)
+        ):  # fmt: skip
+            serve(self, undo, Trigger, f"~/{name}", answer)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        undo.callback(self.destroy_timer, self.create_timer(_TICK_S, self._tick, clock=steady))
+
+    def _begin(self) -> None:
+        self._playback = Playback(self._span[0], self.values["rate"])
+        self._messages = self._in_order()
+        self._next = next(self._messages, None)
+
+    def _in_order(self) -> Iterator[tuple[str, int, bytes]]:
+        begin, end = self._span
+        # Who listens from here on has to know what was latched before.
+        latched = [topic for topic in self._topics if topic in topics.LATCHED_TOPICS]
+        before = {
+            topic: (topic, begin, cdr) for topic, _, cdr in self._bag.messages(latched, None, begin)
+        }
+        yield from before.values()
+        whole = begin == self._bag.start_ns and end is None
+        yield from self._bag.messages(self._topics, None if whole else begin, end)
+
+    # ------------------------------------------------------------------------- playing
+
+    def _tick(self) -> None:
+        try:
+            self._play(time.monotonic())
+        except BagError as err:
+            self.fatal = err
+            self.get_logger().error(f"{type(err).__name__}: {err}")
+
+    def _play(self, now: float) -> None:
+        self._listeners.look()
+        if not self._begun:
+            self._obstacle = self._in_the_way()
+            if self._obstacle:
+                return
+            self._begun = True
+        if self._wanted:
+            self._playback.resume(now)
+        while self._next is not None and self._listeners.room:
+            late = self._playback.late(self._next[1], now)
+            if late is None:
+                break
+            self._late = late
+            self._publish_next()
+        self._tell_time(now)
+        if self._next is None and not self._listeners.waited_for:
+            self._at_the_end()
+
+    def _in_the_way(self) -> str:
+        """Why playing cannot begin yet; empty if it can."""
+        for topic, publisher in self._offers.items():
+            name = publisher.topic_name
+            if topic in _SAMPLES and self.count_publishers(name) > 1:
+                return (
+                    f"another node publishes {name}, and a recording is never mixed with live "
+                    "samples: end it, or play in another namespace (-r __ns:=/replay)"
+                )
+            if topic in _NEEDED and publisher.get_subscription_count() < self.values["listeners"]:
+                return f"nobody listens to {name} yet (parameter listeners)"
+        return "" if self._listeners.known else "who listens has not answered yet"
+
+    def _publish_next(self) -> None:
+        assert self._next is not None
+        topic, self._position_ns, cdr = self._next
+        self._offers[topic].publish(cdr)
+        self._listeners.published(self._offers[topic].topic_name, len(cdr))
+        self._counts[topic] += 1
+        self._next = next(self._messages, None)
+
+    def _tell_time(self, now: float) -> None:
+        if self._time is None:
+            return
+        # Never ahead of what was published: time stands while somebody is waited for.
+        ahead = self._next[1] if self._next is not None else self._position_ns
+        due = self._playback.time_ns(now) if self.values["rate"] else self._position_ns
+        sec, nanosec = divmod(max(min(due, ahead), self._position_ns), NANOSECONDS_PER_S)
+        self._time.publish(ClockMessage(clock=Time(sec=sec, nanosec=nanosec)))
+
+    def _at_the_end(self) -> None:
+        if self.values["loop"]:
+            self._begin()
+            return
+        lost = ", ".join(f"{name} lost {n}" for name, n in self._listeners.lost.items())
+        self.get_logger().info(f"played {self._played()}; {lost or 'all who listen took them'}")
+        self.trigger_shutdown()
+
+    def _played(self) -> str:
+        return ", ".join(f"{n} {relative(topic)}" for topic, n in self._counts.items())
+
+    # ------------------------------------------------------------------------ requests
+
+    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        self._wanted = False
+        self._playback.pause(time.monotonic())
+        response.success, response.message = True, f"paused after {self._played()}"
+
+    def _on_resume(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        self._wanted = True
+        response.success, response.message = True, "playing"
+
+    def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        if self._obstacle or not self._begun:
+            raise OmsmError(self._obstacle or "it has not begun yet; ask again")
+        if self._wanted:
+            raise OmsmError("it is playing; call pause before step")
+        if self._next is None or not self._listeners.room:
+            raise OmsmError("there is no next message, or the last ones have not been taken")
+        topic, stamp, _ = self._next
+        self._publish_next()
+        self._playback.go_to(stamp, time.monotonic())
+        response.success, response.message = True, f"{relative(topic)} of {stamp} ns"
+
+    # --------------------------------------------------------------------- diagnostics
+
+    def report(self) -> Report:
+        """Return how far it is, and what it waits for."""
+        position = (self._position_ns - self._bag.start_ns) / NANOSECONDS_PER_S
+        report = Report("playing", {relative(topic): n for topic, n in self._counts.items()})
+        report.values["position_s"] = position
+        if not self.active:
+            return report
+        report.values["paused"] = not self._wanted
+        report.values["waited_for"] = " ".join(self._listeners.waited_for)
+        if self._obstacle:
+            report.add(ERROR, self._obstacle)
+        for name, count in self._listeners.lost.items():
+            report.add(WARN, f"{name} lost {count} messages on their way")
+        if self._late > _LATE_S:
+            report.add(WARN, f"{self._late:.1f} s behind: who listens takes no more a second")
+        return report
+
+
+def main() -> None:
+    """Entry point of ``ros2 run omsm_ros replay``."""
+    run(PlayerNode)
+
+
+if __name__ == "__main__":
+    main()
