@@ -34,6 +34,9 @@ _EDGE_GUARD = 8
 _FADE_S = 0.5
 _FADE_SHAPE = 12.0
 _SPIKE_SIGMAS = 6.0
+# A smooth peak dwells 1/(√2 - 1) times as long in its last step as in the one before; one that
+# is clipped holds there all that would lie beyond.
+_PILED = 4.0
 # A probe is linear to a few per cent; beyond this a unit or a target is wrong.
 _PLAUSIBLE_GAIN = (0.5, 2.0)
 
@@ -57,7 +60,9 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     motion = _motion(record, source)
     steps = _seen_whole(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)
-    check_gain(_static_gain(problem))
+    if steps.edges:
+        # Of a motion that never rests a lag of half a period is another gain; the fit tells.
+        check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
     return Prepared(_with_reading_steps(problem, steps), steps, spikes)
@@ -183,7 +188,9 @@ def _check_not_clipped(problem: Problem) -> None:
     allowed = max(20 * sample_noise(seen), 3 * quantum, 2e-3 * float(np.ptp(motion)))
     for name, extreme in (("greatest", levels[-1]), ("least", levels[0])):
         there = motion[seen == extreme]
-        if len(there) >= 5 and np.ptp(there) > allowed:
+        near = int(np.sum(np.abs(seen - extreme) < 1.5 * quantum)) - len(there)
+        piled = len(there) >= 5 and len(there) > _PILED * near
+        if piled and np.ptp(there) > allowed:
             raise IdentificationError(
                 f"the probe gives its {name} distance {len(there)} times while the axis moves by "
                 f"{quantity(float(np.ptp(there)), 'm')}: it is clipped; "

@@ -36,7 +36,9 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
     at_rest = float(np.mean(second[still] ** 2))
     total = float(np.sum(weight**2))
     found = float(np.sum(weight * (second**2 - at_rest))) / total
-    spread = at_rest * np.sqrt(2 * _SHARED / total)
+    # Of the excess itself, and of the noise at rest that it exceeds.
+    known_to = 1 / total + (float(np.sum(weight)) / total) ** 2 / float(np.sum(still))
+    spread = at_rest * np.sqrt(2 * _SHARED * known_to)
     return found if found > _CLEARLY * spread else 0.0
 
 

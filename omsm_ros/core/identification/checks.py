@@ -9,7 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
+from omsm_ros.core.dynamics.response_band import (
+    COVERAGE_FACTOR,
+    ResponseLimits,
+    low_frequency_delay_uncertainty,
+)
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import gain_uncertainty_alone
 from omsm_ros.core.identification.departure_checks import agreement, departures, independence
@@ -23,6 +27,10 @@ _WORST_CHI_SQUARE = 1.3
 _LEAST_CHI_SQUARE = 0.3
 # Three times the highest content of the paper's scan, 1.5 Hz: with less there is no use for it.
 _LEAST_TRUSTED_HZ = 5.0
+# Standard uncertainties beyond which a lead is no chance.
+_CLEARLY = 5.0
+# Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms).
+_HARMLESS_DELAY_S = 7e-6
 
 
 def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Finding:
@@ -58,6 +66,31 @@ def timing(scatter: float) -> Finding:
             f"the readings scatter in time by {quantity(scatter, 's')}: in a scan they are "
             "noisier by that times the speed along Z; latch encoder and probe by one trigger",
         ),
+    )
+
+
+def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: float) -> Finding:
+    """Judge a probe that moves before the encoder by -``lag`` [s], u = ``uncertainty`` [s].
+
+    encoder_noise, probe_noise: standard deviation of a reading [m]
+    An encoder may be late, and a scan is late by the same. But the noisier channel is the probe.
+    """
+    if lag > -max(_CLEARLY * uncertainty, _HARMLESS_DELAY_S):
+        return Finding()
+    early = f"the probe moves {quantity(-lag, 's')} before the encoder"
+    if encoder_noise > probe_noise:
+        return Finding(
+            reasons=(
+                f"{early}, and the encoder is noisier ({quantity(encoder_noise, 'm')}) than the "
+                f"probe ({quantity(probe_noise, 'm')}): the two channels are exchanged; exchange "
+                "their columns or topics",
+            )
+        )
+    return Finding(
+        reservations=(
+            f"{early}: the encoder is read late; latch both by one trigger, or keep it exactly so "
+            "in the scan",
+        )
     )
 
 
@@ -131,6 +164,12 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     # What the motion cannot tell makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
+    lambda e: lead(
+        e.dynamics.low_frequency_delay,
+        low_frequency_delay_uncertainty(e.dynamics, e.known.covariance),
+        e.prepared.steps.noise,
+        e.residual.noise,
+    ),
     lambda e: timing(e.residual.timing),
     lambda e: departures(e.searched),
     lambda e: independence(e.searched.survey.independence),

@@ -28,6 +28,14 @@ def test_noise_alone_shows_none(seed):
     assert timing_variance(noise, RATE) == 0.0
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_motion_that_hardly_ever_rests_shows_none(seed):
+    """The few readings at its turning points know the noise to a few per cent only."""
+    rate = 1e-3 * np.sin(2 * np.pi * 3.0 * TIME)
+    noise = np.random.default_rng(seed).normal(0, 10e-9, len(TIME))
+    assert timing_variance(noise, rate) == 0.0
+
+
 def test_a_lag_that_the_model_misses_is_no_scatter():
     noise = np.random.default_rng(2).normal(0, 10e-9, len(TIME))
     assert timing_variance(noise + 50e-6 * RATE, RATE) == 0.0

@@ -1,0 +1,70 @@
+"""Records that look like a fault that they have not; exchanged channels, which look like none."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from omsm_ros.core.fitting.preparation import prepare
+from omsm_ros.core.identification.checks import lead
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.errors import IdentificationError
+
+PERIOD = 1e-3
+TIME = np.arange(0.0, 15.0, PERIOD)
+
+
+def test_a_lag_of_half_a_period_is_no_other_gain():
+    rng = np.random.default_rng(1)
+    lag = 60e-3
+    time = np.arange(0.0, 20.0, PERIOD)
+    z, seen = (20e-6 * signal.chirp(time - late, 0.5, 20.0, 15.0) for late in (0.0, lag))
+    record = MotionRecord.from_arrays(
+        PERIOD, z + rng.normal(0, 0.3e-9, len(z)), -seen + rng.normal(0, 10e-9, len(z))
+    )
+    found = identify(record).calibration
+    assert str(found.certificate["verdict"]).startswith("accepted,")
+    assert found.dynamics.low_frequency_delay == pytest.approx(lag, abs=20e-6)
+    assert found.static_gain == pytest.approx(1.0, abs=1e-3)
+
+
+def late_sine(limit):
+    """A sine that is seen a sixth of a period late, in steps of 10 nm, up to ``limit`` [m]."""
+    z, seen = (20e-6 * np.sin(2 * np.pi * 0.5 * TIME - late) for late in (0.0, 1.0))
+    return MotionRecord.from_arrays(PERIOD, z, np.round(np.minimum(-seen, limit) / 10e-9) * 10e-9)
+
+
+def test_a_peak_that_is_seen_late_is_not_clipped():
+    prepare(late_sine(1.0), "encoder")
+    with pytest.raises(IdentificationError, match="it is clipped"):
+        prepare(late_sine(19.8e-6), "encoder")
+
+
+def test_exchanged_channels_are_named():
+    rng, lag = np.random.default_rng(2), 0.34e-3
+    test = StepTest()
+    time = np.arange(0.0, test.duration, PERIOD)
+    z = test.positions(time).z + rng.normal(0, 0.3e-9, len(time))
+    seen = test.positions(time - lag).z + rng.normal(0, 10e-9, len(time))
+    certificate = identify(MotionRecord.from_arrays(PERIOD, seen, -z)).calibration.certificate
+    assert certificate["verdict"] == "rejected"
+    assert any("channels are exchanged" in reason for reason in certificate["reasons"])
+
+
+@pytest.mark.parametrize(
+    ("lag", "uncertainty", "noises", "told"),
+    [
+        (0.3e-3, 1e-6, (1e-9, 1e-8), ""),
+        (-3e-6, 1e-7, (1e-9, 1e-8), ""),
+        (-30e-6, 1e-5, (1e-9, 1e-8), ""),
+        (-30e-6, 1e-6, (1e-9, 1e-8), "the encoder is read late"),
+        (-30e-6, 1e-6, (1e-8, 1e-9), "channels are exchanged"),
+    ],
+)
+def test_a_probe_that_leads(lag, uncertainty, noises, told):
+    found = lead(lag, uncertainty, *noises)
+    words = " ".join((*found.reasons, *found.reservations))
+    assert told in words
+    assert bool(told) == bool(words)
+    assert bool(found.reasons) == ("exchanged" in told)
