@@ -108,7 +108,9 @@ def _outcome(case: Case) -> Outcome:
 def changed(value: Any, factor: float) -> Any:
     """Return a constant times ``factor``; of a row of values, each; whole numbers stay whole."""
     if isinstance(value, tuple):
-        return tuple(sorted({changed(part, factor) for part in value}))
+        parts = sorted({changed(part, factor) for part in value})
+        # Degrees of a polynomial: offset and slope are in every fit already.
+        return tuple(part for part in parts if part != 1)
     return max(round(value * factor), 1) if isinstance(value, int) else value * factor
 
 

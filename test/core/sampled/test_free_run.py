@@ -99,3 +99,26 @@ def test_the_output_that_rests_where_the_input_has_its_mean():
 def test_too_short_a_record_is_refused(samples):
     with pytest.raises(IdentificationError, match="at least 50"):
         free_run(held(), np.zeros(samples), np.zeros(samples))
+
+
+def test_what_moved_within_the_delay_before_the_record_is_a_state_too():
+    """Cut from a longer record: the first samples answer to inputs that the cut has not."""
+    rng = np.random.default_rng(3)
+    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    discrete = held().discrete
+    late = np.concatenate([np.zeros(7), u - 4.0])[:2000]
+    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, late)
+    assert free_run(held(7), u[503:], y[503:]).rms < 1e-9
+
+
+def test_the_resting_output_of_a_single_step():
+    u = np.where(np.arange(2000) < 400, 3.0, 5.0)
+    discrete = held().discrete
+    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, u - 3.0)
+    found = resting_output(discrete, u, y, np.ones(2000, bool))
+    assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 3.0), abs=1e-6)
+
+
+def test_the_least_record_is_enough():
+    u, y = moving()
+    assert free_run(smooth(), u[:50], y[:50]).rms < 1e-3
