@@ -44,10 +44,10 @@ from omsm_ros.units import NANOMETRE_M, PPM
 TERMS = 15
 LATENCY_S, LATENCY_UNCERTAINTY_S = 50e-6, 2e-6
 _SIZES: dict[str, tuple[float, dict[str, float]]] = {
-    "tilt": (2e-6, {}),
-    "decentre": (0.3e-6, {}),
-    "clocking": (0.1e-3, {}),
-    "centre_x": (0.1e-6, {}),
+    "tilt": (1e-6, {}),
+    "decentre": (0.1e-6, {}),
+    "clocking": (50e-6, {}),
+    "centre_x": (0.05e-6, {}),
     "spindle_axial": (5e-9, {"per_turn": 2}),
     "spindle_radial": (20e-9, {"per_turn": 2}),
     "spindle_tilt": (0.2e-6, {"per_turn": 1}),

@@ -163,6 +163,7 @@ COEFFICIENT = Quantity("coefficient", "", -1e40, 1e40, "check its unit and its s
 TERM_ORDER = Quantity("power", "", 0, 40, "give a smaller one", whole=True)
 TURN = Quantity("angle", "rad", -3.15, 3.15, "give it in radians")
 SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
+PITCH = Quantity("pitch", "rad", -1.0, 1.0, "give it in radians")
 MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
 SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")

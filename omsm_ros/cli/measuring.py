@@ -26,7 +26,7 @@ from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
-from omsm_ros.storage.machine_files import load_geometry, load_limits
+from omsm_ros.storage.machine_files import load_geometry, load_limits, load_pitch
 from omsm_ros.storage.motion_file import load_motion
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.sources_file import load_sources
@@ -56,6 +56,12 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
     sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
+    sub.add_argument(
+        "--pitch",
+        type=Path,
+        metavar="PITCH.csv",
+        help="of Z, measured: columns z_m,pitch_rad; needs abbe_arm in the geometry",
+    )
     sub.add_argument(
         "--lateral-lag", type=number(quantities.LAG), help="of the probe against X and C [s]"
     )
@@ -111,7 +117,12 @@ def _correct(args: argparse.Namespace) -> Facts:
         accept_other_rate=args.override,
         lateral_lag=args.lateral_lag,
         geometry=geometry_of(args.geometry),
+        pitch=load_pitch(args.pitch) if args.pitch else None,
     )
+    if options.pitch is not None and not options.geometry.abbe_arm:
+        raise ConfigurationError(
+            "--pitch without an Abbe arm does nothing; give abbe_arm in --geometry GEOMETRY.yaml"
+        )
     with (
         result_folder(
             args.out, (CLOUD, SYSTEMATIC, DEVIATION, CURVES, FORM, REPORT, SUMMARY)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,13 @@ from omsm_ros.jobs.correct_bag import Correction
 from omsm_ros.storage.fields_file import save_fields
 from omsm_ros.storage.files import SYSTEMATIC
 
+# What a fit takes out of the deviations is no error of theirs any more; how well it does is in
+# the uncertainty of the form.
+_POSE_FREEDOMS: Mapping[str, tuple[str, ...]] = {
+    "tilt": ("tip", "tilt"),
+    "decentre": ("x", "y"),
+    "clocking": ("clocking",),
+}
 # A map with more holes than this hides something.
 _LEAST_SHARE_CORRECTED = 0.95
 
@@ -45,12 +52,14 @@ class Judgement:
 
     options: it was corrected with;  stated: of the machine;  accuracy: asked for, k = 2 [m]
     out: folder for the fields of its systematic errors, None to keep none
+    fitted: freedoms of the pose that are fitted to the nominal surface, or "auto"
     """
 
     options: CorrectionOptions
     stated: MachineSources = NOTHING_STATED
     accuracy: float | None = None
     out: Path | None = None
+    fitted: Sequence[str] = ()
 
     def of(
         self, done: Correction, calibration: Calibration, discretisation: float
@@ -76,12 +85,20 @@ class Judgement:
         return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
 
     def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:
+        counts = _POSE_FREEDOMS if self.options.surface is not None else {}
+        fitted = [
+            name
+            for name, freedoms in _POSE_FREEDOMS.items()
+            if "auto" in self.fitted or set(freedoms) <= set(self.fitted)
+        ]
         return light_of(
             calibration,
-            budget.heights,
+            {name: size for name, size in budget.heights.items() if name not in fitted},
             self.stated,
             accuracy=self.accuracy,
-            against_nominal=self.options.surface is not None,
+            pose_open=[n for n in _POSE_FREEDOMS if n not in fitted]
+            if self.options.surface
+            else (),
             doubts=tuple(_losses(done)),
         )
 
@@ -94,7 +111,7 @@ def live_light(
 ) -> Light:
     """Return the light of what has been corrected so far, by the uncertainty of its points."""
     shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
-    return light_of(calibration, shared, stated, accuracy=accuracy, against_nominal=False)
+    return light_of(calibration, shared, stated, accuracy=accuracy, pose_open=())
 
 
 def _losses(done: Correction) -> Iterator[Reason]:

@@ -85,7 +85,8 @@ def measure(
         by_stamps=by_stamps,
         progress=progress,
     )
-    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out))
+    fitted = register.freedoms if register is not None else ()
+    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out, fitted))
     if register is not None and nominal is not None and done.statistics:
         add_form(out, summary, nominal, register)
     if report:

@@ -11,10 +11,13 @@ import yaml
 
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits
+from omsm_ros.core.machine.pitch_curve import PitchCurve
 from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.quantities import PITCH, POSITION
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text, save_text
 from omsm_ros.storage.schemas import NUMBER, check_form, form
+from omsm_ros.storage.table_file import load_columns
 
 MAX_YAML_BYTES = 100_000
 
@@ -31,6 +34,18 @@ def load_limits(path: Path | str) -> MachineLimits:
     """Read ``LIMITS.yaml``: what servo, probe, spindle and axes can do, units in the names."""
     values = _read_mapping(path, "limits", FileError)
     return _made(MachineLimits, values, FileError, f"limits {str(path)!r}")
+
+
+def load_pitch(path: Path | str) -> PitchCurve:
+    """Read ``PITCH.csv``: columns ``z_m,pitch_rad``, as an autocollimator along Z tells."""
+    z, angle = load_columns(path, ("z_m", "pitch_rad"))
+    what = f"pitch {str(path)!r}"
+    POSITION.checked_all(z, FileError, f"{what}: z_m")
+    PITCH.checked_all(angle, FileError, f"{what}: pitch_rad")
+    try:
+        return PitchCurve(z, angle)
+    except ConfigurationError as err:
+        raise FileError(f"{what}: {err}") from err
 
 
 def save_geometry(path: Path | str, geometry: Geometry) -> None:

@@ -29,6 +29,7 @@ from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.machine.pitch_curve import PitchCurve
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
@@ -57,6 +58,7 @@ class CorrectionOptions:
     systematic: what else is uncertain of the whole scan; into each point's uncertainty goes what
         can be known of it there: what shifts points sideways, only with a ``surface``
     surface: nominal, for its slopes
+    pitch: of Z, measured; over the geometry's Abbe arm it is taken off the encoder
     """
 
     polarity: int = 1
@@ -68,6 +70,7 @@ class CorrectionOptions:
     geometry: Geometry = field(default_factory=Geometry)
     systematic: tuple[SystematicSource, ...] = ()
     surface: Surface | None = None
+    pitch: PitchCurve | None = None
 
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
@@ -230,6 +233,8 @@ class Corrector:
             sample = sample[good]
             axis_values, probe_values = axis_values[:, good], probe_values[:, good]
         x, y, b, c, dynamic_error, moved = axis_values[:RATE]
+        if self._options.pitch is not None:
+            moved = moved - self._options.pitch.over(self._options.geometry.abbe_arm, moved)
         reading, intensity = probe_values
         away = reading * (self._options.polarity / self._static_gain)
         where = workpiece_points(self._options.geometry, (x, y, moved), b, c, away)

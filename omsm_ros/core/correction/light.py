@@ -7,7 +7,7 @@ can be done about it at the machine.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ GREEN, AMBER, RED = "green", "amber", "red"
 
 # A source this much smaller than what is asked for adds a twentieth to it in squares.
 _SETTLED_SHARE = 1 / 3
-_POSE = ("tilt", "decentre", "clocking")
+POSE = ("tilt", "decentre", "clocking")
 # Of each group one statement will do: zero, with a reason, where it is known not to matter.
 _GROUPS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "drift": (
@@ -96,14 +96,15 @@ def light_of(
     stated: MachineSources,
     *,
     accuracy: float | None = None,
-    against_nominal: bool = True,
+    pose_open: Sequence[str] = POSE,
     doubts: Iterable[Reason] = (),
 ) -> Light:
     """Return the light of a scan.
 
     heights: standard uncertainty of the heights from each systematic source, rms [m]
     accuracy: asked for, k = 2 [m]; None takes the uncertainty that is stated
-    against_nominal: the heights are compared with a nominal surface, so the part's pose counts
+    pose_open: sources of the part's pose that count; none where it is not compared with a nominal
+        surface, or is fitted to it
     doubts: what else speaks against it
     """
     uncertainty = 2 * sum(size**2 for size in heights.values()) ** 0.5
@@ -112,7 +113,7 @@ def light_of(
     if verdict == REJECTED:
         found = [Reason("the calibration was rejected", "identify again"), *map(Reason, reasons)]
         return _light(RED, calibration, asked, uncertainty, found)
-    open_ = [*_latency(calibration, heights, accuracy), *_not_settled(stated, against_nominal)]
+    open_ = [*_latency(calibration, heights, accuracy), *_not_settled(stated, pose_open)]
     if not verdict:
         open_.insert(0, Reason("the calibration has no certificate", "identify again"))
     if uncertainty > asked:
@@ -154,12 +155,12 @@ def _latency(
         yield Reason(what, REMEDY)
 
 
-def _not_settled(stated: MachineSources, against_nominal: bool) -> Iterator[Reason]:
-    missing = [name for name in _POSE if not stated.of(name)]
-    if against_nominal and missing:
+def _not_settled(stated: MachineSources, pose_open: Sequence[str]) -> Iterator[Reason]:
+    missing = [name for name in pose_open if not stated.of(name)]
+    if missing:
         yield Reason(
             f"pose of the part not evaluated ({', '.join(missing)})",
-            "register the part to its nominal surface ('omsm form'), or state them",
+            "register the part to its nominal surface (--fit auto, or 'omsm form'), or state them",
         )
     for group, (names, remedy) in _GROUPS.items():
         if not any(stated.of(name) for name in names):

@@ -67,7 +67,8 @@ def test_amber_for_each_thing_that_nobody_looked_at(settled: Calibration, missin
 def test_pose_does_not_count_where_there_is_no_nominal_surface(settled: Calibration) -> None:
     pose = all_but("tilt", "decentre", "clocking")
     assert light(settled, pose).level == AMBER
-    assert light(settled, pose, against_nominal=False).level == GREEN
+    assert light(settled, pose, pose_open=()).level == GREEN
+    assert light(settled, pose, pose_open=("clocking",)).level == AMBER
 
 
 def test_an_open_latency_is_settled_where_it_is_small_for_what_is_asked(
