@@ -96,9 +96,7 @@ class Judgement:
             {name: size for name, size in budget.heights.items() if name not in fitted},
             self.stated,
             accuracy=self.accuracy,
-            pose_open=[n for n in _POSE_FREEDOMS if n not in fitted]
-            if self.options.surface
-            else (),
+            pose_open=[name for name in counts if name not in fitted],
             doubts=tuple(_losses(done)),
         )
 
