@@ -65,23 +65,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--lateral-lag", type=number(quantities.LAG), help="of the probe against X and C [s]"
     )
-    sub.add_argument(
-        "--sources",
-        default="",
-        metavar="SOURCES.yaml",
-        help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
-    )
-    sub.add_argument(
-        "--accuracy",
-        type=number(quantities.BUDGET),
-        help="asked for, k = 2 [m]: what the traffic light is held against",
-    )
-    sub.add_argument(
-        "--lateral",
-        type=number(quantities.UNCERTAINTY),
-        default=0.0,
-        help="standard uncertainty of x and y [m]",
-    )
+    _declare_uncertain(sub)
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
     sub.add_argument(
         "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
@@ -103,6 +87,26 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     declare_fit(sub, None)
     declare_tolerance(sub)
     declare_catalogue(sub)
+
+
+def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--sources",
+        default="",
+        metavar="SOURCES.yaml",
+        help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
+    )
+    sub.add_argument(
+        "--accuracy",
+        type=number(quantities.BUDGET),
+        help="asked for, k = 2 [m]: what the traffic light is held against",
+    )
+    sub.add_argument(
+        "--lateral",
+        type=number(quantities.UNCERTAINTY),
+        default=0.0,
+        help="standard uncertainty of x and y [m]",
+    )
 
 
 def _correct(args: argparse.Namespace) -> Facts:
