@@ -23,7 +23,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 setup: $(PACKAGE)
 
 demo: setup
-	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE))
+	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
 # Two processes, the nodes in one of them (see test/conftest.py); JOBS=0 for one after the other.
 JOBS ?= 2

@@ -20,6 +20,7 @@ NODES = (
     "vibration_monitor",
     "recorder",
     "player",
+    "viewer",
     "cell_emulator",
     "cell_demo",
 )
@@ -38,6 +39,7 @@ setup(
             "x3pio>=2; python_version >= '3.11'",
             "SurfaceTopography>=1.20",
         ],
+        "viewer": ["websockets>=14"],
         "devices": ["pyads", "nidaqmx"],
         "campaign": ["distributed"],
         "catalogue": ["sqlalchemy>=2", "psycopg[binary]>=3.1"],

@@ -21,6 +21,7 @@ ARGUMENTS = {
     "device": ("", "what is connected; empty = as the YAML says", None),
     "emulated": ("false", "start the digital twin and read it", ["true", "false"]),
     "record": ("", "an .mcap file to record into; empty = none", None),
+    "view": ("false", "show the scan in a browser", ["true", "false"]),
     "rviz": ("false", "show the points in RViz", ["true", "false"]),
     "params": (str(SHARE / "config"), "folder of the nodes' YAML files", None),
     "log_level": ("info", "of every node", ["debug", "info", "warn", "error", "fatal"]),
@@ -52,6 +53,8 @@ def cell(context: LaunchContext) -> list[Node]:
     ]
     if given["record"]:
         nodes.append(node(given, "recorder", {"path": given["record"]}))
+    if given["view"] == "true":
+        nodes.append(node(given, "viewer", {}))
     if given["rviz"] == "true":
         nodes.append(rviz(given["namespace"]))
     return nodes

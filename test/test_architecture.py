@@ -15,6 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"nodes", "cli"},
     {"jobs"},
+    {"viewing"},
     {"report", "storage", "devices", "emulators"},
     {"twin", "protocols"},
     {"core"},
@@ -63,6 +64,7 @@ ONLY_IN = {
     "socket": {"devices.transport", "emulators.tcp_server"},
     "rosbags": {"storage"},
     "mcap": {"storage.recording"},
+    "websockets": {"viewing"},
     "matplotlib": {"report"},
     "h5py": {"storage"},
     "x3pio": {"storage.maps"},

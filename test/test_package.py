@@ -33,6 +33,7 @@ OPTIONAL = {
     "h5py": "formats",
     "distributed": "campaign",
     "pyads": "devices",
+    "websockets": "viewer",
     "nidaqmx": "devices",
     "sqlalchemy": "catalogue",
 }

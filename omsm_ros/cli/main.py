@@ -83,6 +83,7 @@ def parser_of(word: str) -> argparse.ArgumentParser:
     demo.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
     demo.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
     demo.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
+    demo.add_argument("--view", action="store_true", help="show the scan in a browser")
     demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
     return parser
 
@@ -93,6 +94,7 @@ def _demo(args: argparse.Namespace) -> int:
     command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]
     command += ["--device", args.device]
     command += ["--disturbances", args.disturbances] if args.disturbances else []
+    command += ["--view"] if args.view else []
     return subprocess.call([*command, *(["--json"] if args.json else [])])
 
 

@@ -27,6 +27,7 @@ from omsm_ros.jobs import measure as measurement
 from omsm_ros.jobs import publish as publication
 from omsm_ros.jobs.correct_bag import correct_bag
 from omsm_ros.jobs.judge_scan import Judgement, with_sources
+from omsm_ros.jobs.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report.common import response_figures, style
 from omsm_ros.report.measurement.cloud_view import CloudView
@@ -67,6 +68,7 @@ class Demonstration:
     time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
     device: what the emulated probe speaks
     disturbance_file: what is wrong with the machine, None for nothing
+    view: whether a browser may look on
     """
 
     out: Path
@@ -75,6 +77,7 @@ class Demonstration:
     start_radius: float = 12.7e-3
     device: str = "six_channel"
     disturbance_file: Path | None = None
+    view: bool = False
     sample_period: float = field(default=1e-3, init=False)
 
     @cached_property
@@ -142,6 +145,11 @@ class Demonstration:
             "seed": self.seed,
         }
 
+    @property
+    def nominal_file(self) -> Path:
+        """What the mirror should be."""
+        return self.out / NOMINAL
+
     def prepare(self) -> None:
         """Make the folder and clear it of an earlier run's results.
 
@@ -162,6 +170,7 @@ class Demonstration:
             if path.is_dir():
                 raise OmsmError(f"{str(path)!r} is a folder and stands in the way; remove it")
             path.unlink(missing_ok=True)
+        write_nominal(self.nominal_file)
         for log in (self.out / "log").glob("*.log"):
             log.unlink()
 

@@ -37,13 +37,18 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
     steps = _write(out / STEPS, step_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
+    write_nominal(out / NOMINAL)
+    return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+
+
+def write_nominal(path: Path) -> None:
+    """Write what the twin's mirror should be."""
     nominal = {
         "shape": "off_axis_paraboloid",
         "parent_focal_length": PAPER_MIRROR.parent_focal_length,
         "off_axis_distance": PAPER_MIRROR.off_axis_distance,
     }
-    save_text(out / NOMINAL, yaml.safe_dump(nominal, sort_keys=False))
-    return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+    save_text(path, yaml.safe_dump(nominal, sort_keys=False))
 
 
 def _write(path: Path, recording: Recording) -> int:

@@ -131,6 +131,9 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
     """Run the cell: step test, identification, scan, recording."""
     with stage("starting the cell and its nodes"):
         _start(node, processes, plan)
+    if plan.view:
+        with stage("look at http://127.0.0.1:8080/ while it scans"):
+            pass
     steps = plan.step_test_samples
     with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
         node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
@@ -148,7 +151,7 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
             lambda: (
                 node.value("confocal_driver", "axes_subscribers") >= 3
                 and node.value("confocal_driver", "confocal_subscribers") >= 3
-                and node.value("corrector", "points_subscribers") >= 1
+                and node.value("corrector", "points_subscribers") >= 1 + plan.view
             ),
         )
     with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
@@ -164,6 +167,8 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
         "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
     )
     processes.start("corrector")
+    if plan.view:
+        processes.start("viewer", nominal=str(plan.nominal_file))
     node.wait_until(
         "the driver, calibrator and corrector to find each other",
         lambda: (
@@ -212,6 +217,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, default=12.7e-3, help="[m]")
     parser.add_argument("--disturbances", type=Path, help="what is wrong with the machine")
+    parser.add_argument("--view", action="store_true", help="show the scan in a browser")
     parser.add_argument("--json", action="store_true")
     # What follows --ros-args is for rclpy, when started by `ros2 run`.
     return parser.parse_args(rclpy.utilities.remove_ros_args(sys.argv)[1:])
@@ -230,6 +236,7 @@ def main() -> None:
         start_radius=args.start_radius,
         device=args.device,
         disturbance_file=args.disturbances,
+        view=args.view,
     )
     stage = Stage(quiet=args.json)
     rclpy.init()

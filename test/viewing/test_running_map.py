@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.running_map import RunningMap
+from omsm_ros.viewing.running_map import RunningMap
 
 
 def whole(running):

@@ -1,0 +1,112 @@
+"""``viewer``: the running scan in a browser; it only looks."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from omsm_msgs.msg import AccelerationBlock, Calibration
+from sensor_msgs.msg import PointCloud2
+
+from omsm_ros import quantities
+from omsm_ros.errors import OmsmError
+from omsm_ros.nodes.diagnostics import Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run
+from omsm_ros.nodes.topics import LATCHED_QOS, MessageInfo, listen
+from omsm_ros.parameters import Parameter
+from omsm_ros.report.live.page import render
+from omsm_ros.storage import conversions
+from omsm_ros.storage.surface_file import load_surface
+from omsm_ros.viewing.live_view import LiveView
+from omsm_ros.viewing.server import LiveServer
+
+PARAMETERS = (
+    Parameter("host", "127.0.0.1", "to listen on; another than loopback needs a token"),
+    Parameter("port", 8080, "of the page", quantities.TCP_PORT),
+    Parameter("token", "", "that must stand in the address behind ?token=; empty = none"),
+    Parameter("nominal", "", "SURFACE.yaml that heights are compared with; empty = none"),
+)
+_LEVELS = {
+    DiagnosticStatus.OK: "OK",
+    DiagnosticStatus.WARN: "WARN",
+    DiagnosticStatus.ERROR: "ERROR",
+    DiagnosticStatus.STALE: "STALE",
+}
+
+
+class ViewerNode(ManagedNode):
+    """Listens to points, calibration, acceleration and diagnostics, and shows them."""
+
+    def __init__(self) -> None:
+        super().__init__("viewer", PARAMETERS)
+        self._refused = 0
+
+    def configure(self, undo: ExitStack) -> None:
+        """Make the page and what it shows."""
+        nominal = self.values["nominal"]
+        self._view = LiveView(load_surface(Path(nominal)) if nominal else None)
+        where = self.get_namespace().strip("/")
+        self._server = LiveServer(
+            self._view,
+            render(f"Cell {where}"),
+            self.values["host"],
+            self.values["port"],
+            self.values["token"],
+        )
+
+    def activate(self, undo: ExitStack) -> None:
+        """Serve the page, and begin to listen."""
+        self._server.start()
+        undo.callback(self._server.stop)
+        self.get_logger().info(f"look at {self._server.address}")
+        listen(self, undo, PointCloud2, "points", self._on_points)
+        listen(self, undo, AccelerationBlock, "acceleration", self._on_acceleration)
+        listen(self, undo, Calibration, "calibration", self._on_calibration, LATCHED_QOS)
+        heard = self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        undo.callback(self.destroy_subscription, heard)
+
+    def report(self) -> Report:
+        """Return where the page is, and what it could not show."""
+        return Report(f"look at {self._server.address}", {"refused_messages": self._refused})
+
+    def _on_points(self, message: Any, info: MessageInfo) -> None:
+        try:
+            self._view.add_points(conversions.cloud_array(message))
+        except OmsmError as err:
+            self._complain(str(err))
+
+    def _on_acceleration(self, message: Any, info: MessageInfo) -> None:
+        try:
+            self._view.add_acceleration(conversions.acceleration_block(message))
+        except OmsmError as err:
+            self._complain(str(err))
+
+    def _on_calibration(self, message: Any, info: MessageInfo) -> None:
+        try:
+            self._view.set_calibration(conversions.calibration(message))
+        except OmsmError as err:
+            self._complain(str(err))
+
+    def _complain(self, text: str) -> None:
+        self._refused += 1
+        self.get_logger().warning(text, throttle_duration_sec=5.0)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        where = self.get_namespace().rstrip("/") + "/"
+        for status in message.status:
+            if status.name.startswith(where):
+                level = _LEVELS.get(status.level, "ERROR")
+                values = {entry.key: entry.value for entry in status.values[:200]}
+                self._view.add_state(status.name, level, status.message, values)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run omsm_ros viewer``."""
+    run(ViewerNode)
+
+
+if __name__ == "__main__":
+    main()

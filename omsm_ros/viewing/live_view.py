@@ -1,0 +1,217 @@
+"""What a browser is shown of a running scan: map, error over time, states, calibration."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import AccelerationBlock
+from omsm_ros.core.spectra.density import density
+from omsm_ros.errors import DataError
+from omsm_ros.units import NANOMETRE_M
+from omsm_ros.viewing.running_map import Grid, RunningMap
+
+LAYERS = ("height", "dynamic_error", "uncertainty")
+"""Of each cell, in this order; ``height`` is the deviation where a nominal surface is known."""
+
+# One entry a second: half an hour.
+_SERIES_ENTRIES = 1800
+_SERIES_STEP_S = 1.0
+_SPECTRUM_SAMPLES = 4096
+_SPECTRUM_LINES = 512
+_SEVERITY = ("OK", "WARN", "STALE", "ERROR")
+# A node that says nothing for so long is gone.
+_FORGOTTEN_S = 10.0
+# Header of the binary part: cells along a side, generation, changed cells, version.
+_HEADER = struct.Struct("<IIIQ")
+
+
+class LiveView:
+    """Takes in what nodes publish, hands out what is new to a browser; safe to share by threads."""
+
+    def __init__(
+        self, nominal: Surface | None = None, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """nominal: what heights are compared with; None shows the heights themselves."""
+        self._nominal, self._monotonic = nominal, monotonic
+        self._lock = threading.Lock()
+        self._map = RunningMap(len(LAYERS))
+        self._points = self._left_out = 0
+        self._series: deque[tuple[float, float, float, float]] = deque(maxlen=_SERIES_ENTRIES)
+        self._bin: list[NDArray[Any]] = []
+        self._bin_start = monotonic()
+        self._nodes: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._calibration: dict[str, Any] = {}
+        self._acceleration: NDArray[np.float64] = np.empty((0, 3))
+        self._acceleration_period = 0.0
+
+    # ------------------------------------------------------------------------ taking in
+
+    def add_points(self, cloud: NDArray[np.void]) -> None:
+        """Take in points (n,) of the contract's fields."""
+        if not len(cloud):
+            return
+        x, y = (np.asarray(cloud[name], np.float64) for name in "xy")
+        height = np.asarray(cloud["height"], np.float64)
+        if self._nominal is not None:
+            height = height - self._nominal.height(x, y)
+        error = np.asarray(cloud["dynamic_error"], np.float64)
+        spread = np.asarray(cloud["uncertainty"], np.float64)
+        with self._lock:
+            taken = self._map.add(x, y, np.column_stack([height, error, spread]))
+            self._points += len(cloud)
+            self._left_out += len(cloud) - taken
+            self._bin.append(np.column_stack([error, spread]))
+            self._close_bin()
+
+    def _close_bin(self) -> None:
+        now = self._monotonic()
+        if now - self._bin_start < _SERIES_STEP_S:
+            return
+        values = np.concatenate(self._bin)
+        self._series.append(
+            (
+                now,
+                float(np.nanmin(values[:, 0])),
+                float(np.nanmax(values[:, 0])),
+                float(np.nanmedian(values[:, 1])),
+            )
+        )
+        self._bin, self._bin_start = [], now
+
+    def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
+        """Take in what a node says of itself; level "OK", "WARN", "STALE" or "ERROR"."""
+        state = {"name": name, "level": level, "message": message[:500], "values": dict(values)}
+        with self._lock:
+            self._nodes[name] = (self._monotonic(), state)
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Take in the calibration in force; another one begins another map."""
+        verdict, reasons = verdict_of(calibration)
+        with self._lock:
+            if self._calibration and self._calibration["id"] != calibration.id:
+                self._restart()
+            self._calibration = {
+                "id": calibration.id,
+                "verdict": verdict,
+                "reasons": list(reasons)[:10],
+                "delay": calibration.dynamics.low_frequency_delay,
+                "valid_up_to": calibration.valid_up_to,
+            }
+
+    def add_acceleration(self, block: AccelerationBlock) -> None:
+        """Take in a block of the accelerometer, for its spectrum."""
+        rows = np.column_stack([block.x, block.y, block.z])
+        with self._lock:
+            if block.sample_period != self._acceleration_period:
+                self._acceleration = np.empty((0, 3))
+                self._acceleration_period = block.sample_period
+            kept = np.concatenate([self._acceleration, rows])
+            self._acceleration = kept[-_SPECTRUM_SAMPLES:]
+
+    def restart(self) -> None:
+        """Begin another map."""
+        with self._lock:
+            self._restart()
+
+    def _restart(self) -> None:
+        self._map.restart()
+        self._series.clear()
+        self._points = self._left_out = 0
+
+    # ----------------------------------------------------------------------- handing out
+
+    def news(self, generation: int, version: int) -> tuple[bytes, int, int] | None:
+        """Return what changed on the map since a browser's generation and version; None if nothing.
+
+        A binary message: header, places (m) as uint32, then each layer (m) as float32 in nm; and
+        the generation and version that the browser then knows.
+        """
+        with self._lock:
+            grid = self._map.grid
+            if grid is None:
+                return None
+            since = version if generation == grid.generation else 0
+            newest = self._map.version
+            if generation == grid.generation and newest == version:
+                return None
+            place, means = self._map.since(since)
+        content = _HEADER.pack(grid.cells, grid.generation, len(place), newest)
+        layers = (means / np.float32(NANOMETRE_M)).T
+        packed = content + place.astype("<u4").tobytes() + layers.astype("<f4").tobytes()
+        return packed, grid.generation, newest
+
+    def state(self) -> dict[str, Any]:
+        """Return everything but the map, as JSON values."""
+        with self._lock:
+            now = self._monotonic()
+            nodes = [
+                {**state, "silent": now - when > _FORGOTTEN_S}
+                for when, state in self._nodes.values()
+            ]
+            grid = self._map.grid
+            return {
+                "points": self._points,
+                "left_out": self._left_out,
+                "compared": self._nominal is not None,
+                "grid": None if grid is None else _grid_entry(grid),
+                "light": _light(nodes, self._calibration),
+                "nodes": nodes,
+                "calibration": self._calibration,
+                "series": [(when - now, *rest) for when, *rest in self._series],
+                "spectrum": self._spectrum(),
+            }
+
+    def _spectrum(self) -> dict[str, Any] | None:
+        rows, period = self._acceleration, self._acceleration_period
+        if not len(rows) or not np.all(np.isfinite(rows)):
+            return None
+        try:
+            found = [density(column - column.mean(), period) for column in rows.T]
+        except DataError:  # too few as yet
+            return None
+        total = np.sqrt(np.sum([one.density for one in found], axis=0))
+        # The greatest of neighbours, so that no line is lost.
+        cuts = np.unique(np.linspace(0, len(total), _SPECTRUM_LINES, endpoint=False).astype(int))
+        peaks = np.maximum.reduceat(total, cuts)
+        return {"frequency": found[0].frequency[cuts].tolist(), "amplitude": peaks.tolist()}
+
+
+def _grid_entry(grid: Grid) -> dict[str, float]:
+    return {
+        "left": grid.left,
+        "bottom": grid.bottom,
+        "pitch": grid.pitch,
+        "cells": grid.cells,
+        "generation": grid.generation,
+    }
+
+
+def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """Green only if every node is well and the calibration was accepted without reservation."""
+    reasons = [f"{n['name']}: {n['message']}" for n in nodes if n["level"] != "OK"]
+    reasons += [f"{n['name']}: says nothing any more" for n in nodes if n["silent"]]
+    worst = max((n["level"] for n in nodes), key=_SEVERITY.index, default="STALE")
+    if not nodes:
+        reasons.append("no node has said anything yet")
+    if any(n["silent"] for n in nodes):
+        worst = "ERROR"
+    verdict = str(calibration.get("verdict", ""))
+    if not calibration:
+        reasons.append("no calibration yet")
+    elif verdict == "rejected":
+        reasons.append("the calibration was rejected")
+        worst = "ERROR"
+    elif verdict != "accepted":
+        reasons.append(f"the calibration is {verdict or 'not judged'}")
+    colour = "red" if worst == "ERROR" else "amber" if reasons else "green"
+    return {"colour": colour, "reasons": reasons[:20]}

@@ -1,0 +1,159 @@
+"""One port for the page and its socket: shows, and takes no orders."""
+
+from __future__ import annotations
+
+import hmac
+import http
+import threading
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.sync.server import Server, ServerConnection, serve
+
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.storage import strict_json
+from omsm_ros.viewing.live_view import LiveView
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_MOST_BROWSERS = 16
+_PERIOD_S = 0.25
+_STATES_EVERY = 2
+# A browser has nothing to say.
+_MOST_BYTES_RECEIVED = 1024
+
+
+class LiveServer:
+    """Serves ``page`` at ``/`` and what is new at ``/live``; each browser has a thread.
+
+    A slow browser is told less often; nothing waits for it, and nothing queues up.
+    """
+
+    def __init__(self, view: LiveView, page: str, host: str, port: int, token: str = "") -> None:
+        """port: 0 takes any that is free;  token: must stand behind ``?token=`` in the address.
+
+        Raises ConfigurationError for a host beyond this computer without a token.
+        """
+        if host not in LOOPBACK and len(token) < 16:
+            raise ConfigurationError(
+                f"viewer on {host!r} can be seen from other computers: give a token of at least 16 "
+                "characters, or host 127.0.0.1"
+            )
+        self._view, self._page, self._token = view, page, token
+        self._host, self._wanted = host, port
+        self._server: Server | None = None
+        self._browsers = threading.Semaphore(_MOST_BROWSERS)
+
+    @property
+    def address(self) -> str:
+        """Return where a browser finds the page; empty while nobody listens."""
+        if self._server is None:
+            return ""
+        port = self._server.socket.getsockname()[1]
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else "")
+
+    def start(self) -> None:
+        """Listen; ConfigurationError if the port is taken."""
+        try:
+            self._server = serve(
+                self._handle,
+                self._host,
+                self._wanted,
+                process_request=self._answer,
+                max_size=_MOST_BYTES_RECEIVED,
+                compression=None,
+                close_timeout=1,
+            )
+        except OSError as err:
+            raise ConfigurationError(
+                f"viewer cannot listen on {self._host}:{self._wanted}: {err}; choose another port"
+            ) from err
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def stop(self) -> None:
+        """Close every connection."""
+        if self._server is not None:
+            self._server.shutdown()
+            self._server = None
+
+    # ------------------------------------------------------------------------- requests
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page, a refusal, or None where the socket may be opened."""
+        place = urlsplit(request.path)
+        given = parse_qs(place.query).get("token", [""])[0]
+        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
+            return _text(http.HTTPStatus.FORBIDDEN, "the address lacks its token\n")
+        if not self._from_here(request):
+            return _text(http.HTTPStatus.FORBIDDEN, "asked for by another page\n")
+        if place.path == "/live":
+            return None
+        if place.path == "/":
+            return _html(self._page)
+        return _text(http.HTTPStatus.NOT_FOUND, "there is only /\n")
+
+    def _from_here(self, request: Request) -> bool:
+        """Whether no page of another origin asks, and the name is one of this computer's.
+
+        A browser sends the page's origin with a socket's request; a foreign name that points here
+        (DNS rebinding) stands in Host.
+        """
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or len(origins) > 1:
+            return False
+        name = urlsplit(f"//{hosts[0]}").hostname or ""
+        if self._host in LOOPBACK and name not in LOOPBACK:
+            return False
+        return not origins or urlsplit(origins[0]).netloc == hosts[0]
+
+    def _handle(self, connection: ServerConnection) -> None:
+        if not self._browsers.acquire(blocking=False):
+            connection.close(1013, "too many browsers")
+            return
+        try:
+            self._tell(connection)
+        except ConnectionClosed:
+            return
+        finally:
+            self._browsers.release()
+
+    def _tell(self, connection: ServerConnection) -> None:
+        generation, version, turn = -1, 0, 0
+        while True:
+            if turn % _STATES_EVERY == 0:
+                state = strict_json.unknown_as_null(self._view.state())
+                connection.send(strict_json.text_of(state))
+            if (news := self._view.news(generation, version)) is not None:
+                content, generation, version = news
+                connection.send(content)
+            turn += 1
+            try:
+                connection.recv(timeout=_PERIOD_S)  # says nothing of use, but tells a closed line
+            except TimeoutError:
+                continue
+
+
+def _html(text: str) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": "text/html; charset=utf-8",
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+        }
+    )
+    return _response(http.HTTPStatus.OK, headers, text)
+
+
+def _text(status: http.HTTPStatus, text: str) -> Response:
+    return _response(status, Headers({"Content-Type": "text/plain; charset=utf-8"}), text)
+
+
+def _response(status: http.HTTPStatus, headers: Headers, text: str) -> Response:
+    body = text.encode()
+    headers["Content-Length"] = str(len(body))
+    headers["Connection"] = "close"
+    return Response(status.value, status.phrase, headers, body)
