@@ -29,6 +29,7 @@ PARTS = (
         "devices",
         "real_data",
         "selfcal",
+        "spectra",
         "form",
         "budget",
     ),

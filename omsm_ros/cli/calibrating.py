@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -47,18 +46,17 @@ def _verify(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("reading", args.json) as progress:
         check = path_check_of(args.bag, calibration, progress)
-    edges = np.arange(0.0, math.floor(check.frequency.max()) + 1.0)
     bands = [
         {
-            "from": float(low),
-            "to": float(low + 1),
+            "from": low,
+            "to": high,
             "error_before": _rms(check.error_before[inside]),
             "error_after": _rms(check.error_after[inside]),
             "lag_before": float(np.mean(check.lag_before[inside])),
             "lag_after": float(np.mean(check.lag_after[inside])),
         }
-        for low in edges
-        if np.any(inside := (check.frequency >= low) & (check.frequency < low + 1))
+        for low, high in check.excited
+        if np.any(inside := (check.frequency >= low) & (check.frequency < high))
     ]
     return {"rms_before": check.rms_before, "rms_after": check.rms_after, "bands": bands}
 

@@ -85,10 +85,30 @@ def parser_of(word: str) -> argparse.ArgumentParser:
     demo.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
     demo.add_argument("--view", action="store_true", help="show the scan in a browser")
     demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
+    demo.add_argument(
+        "--experiment",
+        choices=("chirp", "circles", "vibration", "mirror"),
+        help="one of the paper's, Fig. 9, 10, 11 or 8, beside ours; needs no ROS",
+    )
     return parser
 
 
+def _experiment(args: argparse.Namespace) -> int:
+    from omsm_ros.jobs.paper_experiments import run_experiment
+
+    facts = run_experiment(args.experiment, args.out, args.seed)
+    if args.json:
+        print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
+        return DONE
+    for row in facts["compared"]:
+        print(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
+    print(f"written: {args.out / 'report.html'}")
+    return DONE
+
+
 def _demo(args: argparse.Namespace) -> int:
+    if args.experiment:
+        return _experiment(args)
     # The demonstration runs real nodes, so it is one; ROS is imported only there.
     command = [sys.executable, "-m", "omsm_ros.nodes.cell_demo_node", "--out", str(args.out)]
     command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]

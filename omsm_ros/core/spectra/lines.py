@@ -139,8 +139,9 @@ def _reserved(
     found = {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
     if path is not None:
         # So many turns are in a metre of the innermost ring, and of the outermost.
-        ring = np.diff(turn.values[::_STRIDE]) / np.diff(path.values[::_STRIDE])
-        most, least = float(np.max(abs(ring))), float(np.min(abs(ring)))
+        along = abs(np.diff(path.values[::_STRIDE]))
+        ring = abs(np.diff(turn.values[::_STRIDE]))[along > 0] / along[along > 0]
+        most, least = float(np.max(ring)), float(np.min(ring))
         found[PATH] = [
             (
                 order * (most + least) / 2,

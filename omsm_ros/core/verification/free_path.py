@@ -9,6 +9,11 @@ from scipy import signal
 
 from omsm_ros.core.samples.blocks import FloatArray
 
+# Of the motion; a longer taper would hide where a sweep begins and ends.
+_TAPERED = 0.02
+# Share of the strongest band's power.
+_EXCITED = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class PathCheck:
@@ -17,6 +22,7 @@ class PathCheck:
     frequency: instantaneous [Hz];  error_before, error_after: [m]
     lag_before, lag_after: of the probe behind the encoder, and behind the model [rad]
     rms_before, rms_after: [m]
+    excited: bands of a hertz (from, to) in which the motion has power
     """
 
     frequency: FloatArray
@@ -26,6 +32,7 @@ class PathCheck:
     lag_after: FloatArray
     rms_before: float
     rms_after: float
+    excited: tuple[tuple[float, float], ...]
 
 
 def check_path(
@@ -53,7 +60,20 @@ def check_path(
         lag_after=_lag(predicted, seen),
         rms_before=float(np.sqrt(np.mean(before**2))),
         rms_after=float(np.sqrt(np.mean(after**2))),
+        excited=excited_bands(z, sample_period),
     )
+
+
+def excited_bands(z: FloatArray, sample_period: float) -> tuple[tuple[float, float], ...]:
+    """Return the bands of a hertz (from, to) in which a motion ``z`` (n,) [m] has power.
+
+    Elsewhere the instantaneous frequency of a noisy motion strays, and nothing is told there.
+    """
+    power = abs(np.fft.rfft(_centred(z) * signal.windows.tukey(len(z), _TAPERED))) ** 2
+    band = np.floor(np.arange(len(power)) / (len(z) * sample_period)).astype(np.int64)
+    in_band = np.bincount(band, power)
+    excited = np.flatnonzero(in_band > _EXCITED * in_band.max())
+    return tuple((float(low), float(low + 1)) for low in excited)
 
 
 def _centred(values: FloatArray) -> FloatArray:

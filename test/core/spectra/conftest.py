@@ -12,7 +12,7 @@ NM = 1e-9
 
 
 def spiral(
-    name, lines, *, seconds=20.0, rpm=30.0, feed=1e-4, radius=12.7e-3, rate=1000.0, noise=5 * NM,
+    name, lines, *, seconds=14.0, rpm=30.0, feed=1e-4, radius=12.7e-3, rate=1000.0, noise=5 * NM,
     seed=1, jitter=0.0, lost=0.0, gap=(0.0, 0.0),
 ):  # fmt: skip
     """lines: (over, frequency, amplitude) with over one of t, s, r, c; feed 0 is a circle."""

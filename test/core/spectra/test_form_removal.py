@@ -26,7 +26,7 @@ def test_a_flat_part_needs_no_high_degree(made):
     signal = made("A", [("r", 1 / 80e-6, 5e-9)])
     found = without_form(signal)
     assert found.degree == 2
-    assert np.std(found.residual) == pytest.approx(np.std(signal.height), rel=0.01)
+    assert np.std(found.residual) == pytest.approx(np.std(signal.height), rel=0.03)
 
 
 def test_the_spindle_repeats_alike_at_every_radius_and_a_figure_does_not(made):

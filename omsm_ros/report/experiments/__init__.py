@@ -1,0 +1,1 @@
+"""Pages that set the paper's experiments beside ours."""

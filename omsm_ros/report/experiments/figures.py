@@ -1,0 +1,46 @@
+"""Figures of the paper's experiments on the twin."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.verification.free_path import PathCheck
+from omsm_ros.report.common import style
+from omsm_ros.units import DEGREE_RAD, NANOMETRE_M
+
+_WIDTH_IN = 9.2
+
+
+def chirp(time: FloatArray, check: PathCheck, model_lag: FloatArray) -> Figure:
+    """Fig. 9b to d: error over time, its rms by band, lag by band; ``model_lag``: true [rad]."""
+    made, axes = style.figure(_WIDTH_IN, 8.0, 3, 1)
+    for values, colour, name in (
+        (check.error_before, style.BEFORE, "before"),
+        (check.error_after, style.AFTER, "after"),
+    ):
+        at, low, high = style.envelope(time, values / NANOMETRE_M)
+        axes[0, 0].fill_between(at, low, high, color=colour, alpha=0.7, label=name, linewidth=0)
+    style.label(axes[0, 0], x="time [s]", y="nm", title="Error on the free path")
+    style.legend_above(axes[0, 0])
+    middle = np.array([(low + high) / 2 for low, high in check.excited])
+    for errors, lags, colour, name in (
+        (check.error_before, check.lag_before, style.BEFORE, "before"),
+        (check.error_after, check.lag_after, style.AFTER, "after"),
+    ):
+        inside = [_inside(check, band) for band in check.excited]
+        rms = [np.sqrt(np.mean(errors[k] ** 2)) / NANOMETRE_M for k in inside]
+        lag = [np.mean(lags[k]) / DEGREE_RAD for k in inside]
+        axes[1, 0].semilogy(middle, rms, "o-", color=colour, markersize=3.5, label=name)
+        axes[2, 0].plot(middle, lag, "o-", color=colour, markersize=3.5, label=name)
+    axes[2, 0].plot(middle, model_lag / DEGREE_RAD, "--", color=style.TRUTH, label="true response")
+    style.label(axes[1, 0], x="frequency [Hz]", y="nm rms", title="Amplitude error by frequency")
+    style.label(axes[2, 0], x="frequency [Hz]", y="degrees", title="Phase lag (Hilbert)")
+    for one in axes[1:, 0]:
+        style.legend_above(one)
+    return made
+
+
+def _inside(check: PathCheck, band: tuple[float, float]) -> np.ndarray:
+    return np.asarray((check.frequency >= band[0]) & (check.frequency < band[1]))
