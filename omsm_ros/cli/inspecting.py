@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
-from omsm_ros.jobs.inspect_bag import as_json, inspect_bag
+from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
@@ -22,8 +22,8 @@ def _act(args: argparse.Namespace) -> Facts:
     if args.repair:
         return _repaired(args.bag)
     with progress_bar("reading", args.json) as progress:
-        found = inspect_bag(args.bag, progress)
-    return {"bag": str(args.bag), "topics": as_json(found)}
+        found: Inspection = inspect_bag(args.bag, progress)
+    return {"bag": str(args.bag), **found.entry()}
 
 
 def _repaired(bag: Path) -> Facts:
@@ -50,6 +50,7 @@ def _show(facts: Facts) -> None:
     for topic in facts["topics"]:
         period = topic["sample_period"]
         print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+    table([("wrong", text) for text in facts["faults"]] or [("wrong", "nothing was found")])
 
 
 COMMANDS = (Command("inspect", "show what a bag holds, or repair it", _declare, _act, _show),)

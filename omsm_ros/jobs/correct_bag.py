@@ -19,7 +19,9 @@ from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.limits import PathStart, ScanPath
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
@@ -41,7 +43,7 @@ class Correction:
     largest_uncertainty: [m];  points: evenly chosen, as in the cloud
     trace: points that stand for the scan where its systematic errors are judged
     path: its start, None without axes
-    sample_period: [s]
+    sample_period: [s];  faults: what counters and stamps of the recording say against it
     """
 
     account: dict[str, Any]
@@ -55,6 +57,7 @@ class Correction:
     trace: ScanTrace
     path: ScanPath | None
     sample_period: float
+    faults: tuple[str, ...] = ()
 
 
 def correct_bag(
@@ -90,9 +93,9 @@ def correct_bag(
         overridden = "; ".join(["OVERRIDDEN", *scan.reasons]) if scan.reasons else ""
         comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
         with PlyWriter(cloud, comment) as ply:
-            found = _Findings(nominal)
+            found = _Findings(nominal, by_counter=by_stamps is None)
             for block, points in scan.steps():
-                found.path.add(block)
+                found.see(block)
                 if points is not None:
                     if nominal is not None and lateral:
                         points = with_lateral(points, nominal, lateral)
@@ -103,13 +106,28 @@ def correct_bag(
 class _Findings:
     """What is learnt of the points while they pass."""
 
-    def __init__(self, nominal: Surface | None) -> None:
-        self._nominal = nominal
+    def __init__(self, nominal: Surface | None, by_counter: bool) -> None:
+        self._nominal, self._by_counter = nominal, by_counter
+        self._axes, self._distance = StreamWatch(), StreamWatch()
         names = ("error",) if nominal is None else ("error", "raw", "corrected")
         self._running = {name: RunningStatistics() for name in names}
         self.largest = 0.0
         self.drawn = EvenSelection(MOST_DRAWN)
         self.path = PathStart(MOST_JUDGED)
+
+    def see(self, block: AxisBlock | DistanceBlock | None) -> None:
+        if block is None:
+            return
+        self.path.add(block)
+        (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
+
+    def faults(self, period: float) -> tuple[str, ...]:
+        """What counters and stamps say; those of axes that were joined by stamps are not theirs."""
+        found = [*self._distance.faults("distance")]
+        if self._by_counter:
+            skew = counter_skew(self._axes, self._distance)
+            found = [*self._axes.faults("axes"), *found, *skew_fault(skew, period)]
+        return tuple(found)
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
         self.drawn.add(packed)
@@ -142,4 +160,5 @@ def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
         trace=scan.trace,
         path=found.path.path(),
         sample_period=scan.sample_period,
+        faults=found.faults(scan.sample_period),
     )

@@ -1,20 +1,14 @@
-"""What is in a bag: topics, rates, gaps, restarts, invalid readings."""
+"""What is in a bag, and what is wrong with it."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
 
-import numpy as np
-
-from omsm_ros.core.samples.blocks import (
-    Block,
-    DistanceBlock,
-)
-from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
+from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
+from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
-
-# ---------------------------------------------------------------------------- inspection
+from omsm_ros.storage.recording.topics import relative
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +16,7 @@ class StreamInspection:
     """What a stream of blocks holds.
 
     gaps: places where the trigger counter skips; missing: samples skipped there
-    restarts: places where it falls back
+    restarts: places where it falls back;  invalid: readings that are none
     """
 
     topic: str
@@ -37,40 +31,69 @@ class StreamInspection:
     invalid: int = 0
 
 
-def inspect_bag(path: Path, progress: Progress = no_progress) -> list[StreamInspection]:
-    """Look through a bag: topics, samples, rates, gaps, restarts, invalid readings."""
+@dataclass(frozen=True)
+class Inspection:
+    """streams: by topic;  faults: what is wrong, in words for people."""
+
+    streams: list[StreamInspection]
+    faults: list[str] = field(default_factory=list)
+
+    def entry(self) -> dict[str, object]:
+        """JSON values."""
+        return {"topics": [asdict(stream) for stream in self.streams], "faults": self.faults}
+
+
+def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspection:
+    """Look through a bag: topics, samples, rates, gaps, restarts, invalid readings, faults."""
     with bags.BagReader(path) as bag:
         topics = bag.topics()
-    streams = {bags.AXES_TOPIC, bags.DISTANCE_TOPIC, bags.REFERENCE_TOPIC, bags.ACCELERATION_TOPIC}
-    present = [t.topic for t in topics if t.topic in streams]
-    blocks = read_blocks(path, present, progress)
-    return [
-        _inspect(t, blocks[t.topic])
-        if blocks.get(t.topic)
-        else StreamInspection(t.topic, t.type, t.messages)
-        for t in topics
-    ]
+        present = [t.role for t in topics if t.role in bags.BLOCK_TOPICS and t.messages]
+        watches = {topic: StreamWatch() for topic in present}
+        total = bag.count(present)
+        for done, topic, block in bag.blocks(*present):
+            watches[topic].add(block)
+            progress(done, total)
+        if any(t.role == bags.ACCELERATION_TOPIC and t.messages for t in topics):
+            watches[bags.ACCELERATION_TOPIC] = StreamWatch()
+            for topic, block in bag.records(bags.ACCELERATION_TOPIC):
+                watches[topic].add(block)
+        faults = [] if bag.indexed else [_NO_INDEX]
+    streams = [_inspect(t, watches.get(t.role)) for t in topics]
+    return Inspection(streams, [*faults, *_faults(watches)])
 
 
-def _inspect(topic: bags.TopicSummary, blocks: list[Block]) -> StreamInspection:
-    first = np.array([b.first_sample for b in blocks])
-    length = np.array([len(b) for b in blocks])
-    skip = first[1:] - (first + length)[:-1]
-    period = blocks[0].sample_period
+_NO_INDEX = (
+    "it has no index: its recording was ended hard, or the disk was full, so the last moments may "
+    "be missing; 'omsm inspect --repair' makes a copy with one"
+)
+
+
+def _faults(watches: dict[str, StreamWatch]) -> Iterator[str]:
+    for topic, watch in watches.items():
+        yield from watch.faults(relative(topic))
+    axes, distance = watches.get(bags.AXES_TOPIC), watches.get(bags.DISTANCE_TOPIC)
+    if axes and distance and axes.samples and distance.samples:
+        period = min(axes.periods)
+        if period == min(distance.periods):
+            yield from skew_fault(counter_skew(axes, distance), period)
+    for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance")):
+        if topic not in watches:
+            yield f"no {what}: there is nothing on {topic!r} to identify or correct with"
+
+
+def _inspect(topic: bags.TopicSummary, watch: StreamWatch | None) -> StreamInspection:
+    if watch is None or not watch.samples:
+        return StreamInspection(topic.topic, topic.type, topic.messages)
+    period = min(watch.periods)
     return StreamInspection(
         topic=topic.topic,
         type=topic.type,
         messages=topic.messages,
-        samples=int(length.sum()),
+        samples=watch.samples,
         sample_period=period,
-        duration=float(length.sum() * period),
-        gaps=int(np.sum(skip > 0)),
-        missing=int(skip[skip > 0].sum()),
-        restarts=int(np.sum(skip < 0)),
-        invalid=sum(int(np.sum(~b.ok)) for b in blocks if isinstance(b, DistanceBlock)),
+        duration=float(watch.samples * period),
+        gaps=watch.places,
+        missing=watch.missing,
+        restarts=watch.restarts,
+        invalid=watch.invalid,
     )
-
-
-def as_json(inspections: list[StreamInspection]) -> list[dict[str, object]]:
-    """JSON values of an inspection."""
-    return [asdict(inspection) for inspection in inspections]

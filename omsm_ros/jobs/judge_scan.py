@@ -113,6 +113,7 @@ def live_light(
 
 
 def _losses(done: Correction) -> Iterator[Reason]:
+    yield from map(Reason, done.faults)
     if beyond := done.account["axes"]["counted"].get("beyond"):
         yield Reason(
             f"{beyond} samples lie beyond the range of the calibration set",

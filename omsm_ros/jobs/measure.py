@@ -152,7 +152,7 @@ def summarise(
         "warnings": [f"overridden: {reason}" for reason in done.reasons],
     }
     if not done.statistics:
-        summary["warnings"] += ["not one sample could be corrected; see the reasons"]
+        summary["warnings"] += [*done.faults, "not one sample could be corrected; see the reasons"]
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")

@@ -57,6 +57,9 @@ _BLOCKS: dict[str, type] = {
     REFERENCE_TOPIC: DistanceBlock,
 }
 
+BLOCK_TOPICS = frozenset(_BLOCKS)
+"""Topics that :meth:`BagReader.blocks` joins."""
+
 # Of messages that are joined: a block costs some 300 µs besides its samples, a fifth of the whole
 # at 1 MB; beyond 8 MB only memory grows (processor time of 5 million points: 3.3 s at 1 MB, 2.7 s
 # at 8 MB, 2.7 s at 16 MB).
@@ -133,6 +136,13 @@ class BagReader:
             TopicSummary(name, kind, count, roles.get(name, ""))
             for (name, kind), count in sorted(counts.items())
         ]
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the recording was completed; an MCAP file that was not has no index."""
+        parts = getattr(self._reader.storage, "storages", [self._reader.storage])
+        scanned = [p for p in parts if hasattr(p, "chunks") and not p.chunks]
+        return not any(part.metadata.message_count for part in scanned)
 
     @property
     def start_ns(self) -> int:

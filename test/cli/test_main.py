@@ -256,7 +256,8 @@ def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypat
 def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
     from omsm_ros.cli import inspecting
 
-    monkeypatch.setattr(inspecting, "as_json", lambda _: [{"a": float("nan"), "b": [float("inf")]}])
+    told = {"topics": [{"a": float("nan"), "b": [float("inf")]}], "faults": []}
+    monkeypatch.setattr(inspecting.Inspection, "entry", lambda _: told)
     status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0
     assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

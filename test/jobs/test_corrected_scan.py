@@ -14,6 +14,8 @@ from omsm_ros.errors import BagError, CalibrationError
 from omsm_ros.jobs import corrected_scan
 from omsm_ros.jobs.correct_bag import correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
+from omsm_ros.jobs.inspect_bag import inspect_bag
+from omsm_ros.jobs.measure import measure
 from omsm_ros.storage import bags, conversions, message_types
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.recording.bag_writer import BagWriter
@@ -156,3 +158,38 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
     assert done.largest_uncertainty == pytest.approx(cloud["uncertainty"].max(), rel=1e-6)
     assert len(done.path.z) == 40_000
     assert done.sample_period == 1e-3
+
+
+@pytest.mark.parametrize("samples", [1, 10])
+def test_a_probe_whose_counter_is_off_takes_the_green_away(
+    tmp_path, small_scan_blocks, true_calibration, samples
+):
+    """The pairs are of different instants, and every count is accounted for all the same."""
+    path = tmp_path / "off.mcap"
+    with BagWriter(path, TOPICS) as bag:
+        for axes, distance in small_scan_blocks[:20]:
+            bag.write_axes(axes)
+            bag.write_distance(replace(distance, first_sample=distance.first_sample + samples))
+    said = light_reasons(path, true_calibration, tmp_path)
+    assert any(f"{samples} samples: their counters were not started together" in s for s in said)
+    assert any(f"{samples} samples: their counters" in s for s in inspect_bag(path).faults)
+
+
+def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
+    tmp_path, small_scan_blocks, true_calibration
+):
+    path = tmp_path / "gap.mcap"
+    with BagWriter(path, TOPICS) as bag:
+        for axes, distance in small_scan_blocks[:8] + small_scan_blocks[10:20]:
+            bag.write_axes(axes)
+            bag.write_distance(distance)
+    said = light_reasons(path, true_calibration, tmp_path)
+    assert [s for s in said if "200 trigger numbers are missing (800 to 999)" in s]
+    stream, _ = inspect_bag(path).streams
+    assert (stream.gaps, stream.missing) == (1, 200)
+
+
+def light_reasons(path, calibration, folder):
+    light = measure(path, calibration, folder / "out", report=False)["light"]
+    assert light["level"] != "green"
+    return [reason["what"] for reason in light["reasons"]]

@@ -1,0 +1,104 @@
+"""What counters and stamps say, of recordings whose faults are known because they were made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, Status
+from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
+
+PERIOD = 1e-3
+EPOCH = 1_763_000_000_000_000_000
+
+
+def axes(first: int, samples: int = 100, offset_ns: int = 0) -> AxisBlock:
+    zeros = {name: np.zeros(samples) for name in "xyzbc"}
+    stamp = EPOCH + first * 1_000_000 + offset_ns
+    return AxisBlock(stamp_ns=stamp, first_sample=first, sample_period=PERIOD, **zeros)
+
+
+def distance(first: int, samples: int = 100, counter: int = 0) -> DistanceBlock:
+    stamp = EPOCH + first * 1_000_000
+    return DistanceBlock(
+        stamp_ns=stamp,
+        first_sample=first + counter,
+        sample_period=PERIOD,
+        distance=np.zeros(samples),
+    )
+
+
+def watched(*blocks: Block) -> StreamWatch:
+    watch = StreamWatch()
+    for block in blocks:
+        watch.add(block)
+    return watch
+
+
+def faults(*blocks: Block) -> list[str]:
+    return list(watched(*blocks).faults("axes"))
+
+
+def test_nothing_is_said_of_a_good_stream() -> None:
+    assert faults(*(axes(first) for first in range(0, 1000, 100))) == []
+
+
+def test_missing_trigger_numbers_are_counted_and_named() -> None:
+    watch = watched(axes(0), axes(150), axes(250), axes(400), axes(1000), axes(2000))
+    assert (watch.missing, watch.places) == (50 + 50 + 500 + 900, 4)
+    (said,) = watch.faults("axes")
+    assert "1500 trigger numbers are missing" in said
+    assert "100 to 149, 350 to 399, 500 to 999 and 1 more" in said
+
+
+def test_what_comes_late_into_a_gap_was_not_missing() -> None:
+    assert watched(axes(0), axes(200), axes(100)).missing == 0
+
+
+def test_a_restart_and_a_repetition_are_told_apart() -> None:
+    later = replace(axes(0), stamp_ns=EPOCH + 3_600 * 10**9)
+    assert "began anew 1 times" in faults(axes(0), axes(100), later)[0]
+    assert "100 samples repeat" in faults(axes(0), axes(100), axes(100))[0]
+
+
+def test_another_period_and_a_probe_that_sees_nothing() -> None:
+    other = replace(axes(100), sample_period=2e-3)
+    assert "sample periods from 0.001 s to 0.002 s" in faults(axes(0), other)[0]
+    blind = replace(distance(0), status=np.full(100, Status.NO_TARGET, np.uint8))
+    assert "not one of 100 readings is valid" in faults(blind)[0]
+
+
+@pytest.mark.parametrize("samples", [1, -1, 10, 100, 400])
+def test_a_counter_that_is_off_is_found_by_the_stamps(samples: int) -> None:
+    one = watched(*(axes(first) for first in range(0, 5000, 100)))
+    other = watched(*(distance(first, counter=samples) for first in range(100, 5000, 100)))
+    skew = counter_skew(one, other)
+    assert skew == pytest.approx(samples * PERIOD, abs=1e-9)
+    (said,) = skew_fault(skew, PERIOD)
+    assert f"{samples} samples" in said
+
+
+def test_scattered_stamps_of_two_clocks_are_no_fault() -> None:
+    random = np.random.default_rng(2)
+    one = watched(*(axes(f, offset_ns=int(random.normal(0, 2e5))) for f in range(0, 20_000, 100)))
+    other = watched(*(distance(first) for first in range(0, 20_000, 100)))
+    assert list(skew_fault(counter_skew(one, other), PERIOD)) == []
+
+
+def test_blocks_of_other_lengths_and_a_recording_in_time_lapse() -> None:
+    """Twenty times faster than real: stamps advance by a twentieth of the period."""
+
+    def lapsed(block: Block) -> Block:
+        return replace(block, stamp_ns=EPOCH + (block.stamp_ns - EPOCH) // 20)
+
+    one = watched(*(lapsed(axes(first, 70)) for first in range(0, 7000, 70)))
+    other = watched(*(lapsed(distance(first)) for first in range(0, 7000, 100)))
+    assert counter_skew(one, other) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_one_block_each_and_none_in_common() -> None:
+    assert counter_skew(watched(axes(0)), watched(distance(0, counter=5))) == pytest.approx(5e-3)
+    assert counter_skew(watched(axes(0)), StreamWatch()) is None
+    assert list(skew_fault(None, PERIOD)) == []
