@@ -9,6 +9,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, table
 from omsm_ros.cli.exporting import UNIT
+from omsm_ros.cli.fit_option import freedoms
 from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.compare_measurements import (
@@ -50,6 +51,13 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="taken off both first")
     sub.add_argument(
+        "--register",
+        type=freedoms,
+        metavar="FREEDOMS",
+        help="of each to the nominal surface first, as 'omsm form' has them: 'auto', or of "
+        "piston,tip,tilt,x,y,clocking,power",
+    )
+    sub.add_argument(
         "--uncertainty",
         type=number(quantities.UNCERTAINTY),
         help="standard uncertainty of the heights of a file that carries none [m]",
@@ -72,6 +80,8 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
 
 
 def _difference(args: argparse.Namespace) -> Facts:
+    if args.register and args.nominal is None:
+        raise ConfigurationError("--register needs the surface; give --nominal SURFACE.yaml")
     ways = Ways(
         freedoms=args.fit,
         uncertainty=args.uncertainty,
@@ -79,6 +89,7 @@ def _difference(args: argparse.Namespace) -> Facts:
         units=args.unit,
         spacing=args.spacing,
         length=args.correlation_length,
+        register=args.register,
     )
     nominal = load_surface(args.nominal) if args.nominal else None
     found, facts = compare_measurements(args.a, args.b, ways, nominal)

@@ -25,6 +25,7 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import FileError
+from omsm_ros.jobs.registered_points import registered
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import (
@@ -57,6 +58,7 @@ class Ways:
     drift: standard deviation at the end of a scan whose fields hold none [m]
     units: of files that do not carry them;  spacing: of the places compared [m]
     length: over which errors of unknown form are correlated [m]
+    register: freedoms in which each is registered to the nominal surface first; None: it is not
     """
 
     freedoms: Sequence[str] = SEATED
@@ -65,6 +67,7 @@ class Ways:
     units: LengthUnits | None = None
     spacing: float | None = None
     length: float | None = None
+    register: Sequence[str] | None = None
 
 
 def measurement_at(path: Path, ways: Ways, nominal: Surface | None) -> Measurement:
@@ -73,10 +76,10 @@ def measurement_at(path: Path, ways: Ways, nominal: Surface | None) -> Measureme
     Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
     """
     points = read_points(path, ways.units)
-    if nominal is not None:
+    if nominal is not None and ways.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)
-    return Measurement(
+    measured = Measurement(
         name=str(path),
         points=points,
         fields=_fields_beside(path, points),
@@ -84,6 +87,9 @@ def measurement_at(path: Path, ways: Ways, nominal: Surface | None) -> Measureme
         drift=ways.drift,
         calibration=_calibration_of(path),
     )
+    if nominal is None or ways.register is None:
+        return measured
+    return registered(measured, nominal, ways.register)
 
 
 def _calibration_of(path: Path) -> str:

@@ -9,6 +9,7 @@ from omsm_ros.cli.main import BAD_INPUT, DONE, main
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.jobs.measure import measure
 from omsm_ros.storage import bags
+from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.disturbances import Disturbances
@@ -119,6 +120,28 @@ def test_the_nominal_surface_is_taken_off_both(results, tmp_path, capsys):
     assert facts["difference"]["rms"] == pytest.approx(bare["difference"]["rms"], rel=0.02)
 
 
+def test_each_may_be_registered_to_the_nominal_surface_first(results, tmp_path, capsys):
+    """Clamped askew by 20 mrad: a paraboloid that is turned is no longer the same over x and y."""
+    table = CloudFile(results["fast"] / "cloud.ply").read()
+    x, y, height = (table[name].astype(float) for name in ("x", "y", "height"))
+    turn = 20e-3
+    moved = [x * np.cos(turn) - height * np.sin(turn), y, x * np.sin(turn) + height * np.cos(turn)]
+    np.savetxt(tmp_path / "askew.xyz", np.column_stack(moved)[::3], header="x_m y_m z_m")
+    nominal = tmp_path / "mirror.yaml"
+    nominal.write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    pair = (results["slow"], tmp_path / "askew.xyz", "--uncertainty", "3e-9", "--nominal", nominal)
+    _, askew = difference(capsys, tmp_path / "d", *pair)
+    assert askew["verdict"] == "differ"
+    _, facts = difference(capsys, tmp_path / "e", *pair, "--register", "piston,tip,tilt")
+    assert facts["verdict"] == "agree"
+    assert facts["difference"]["rms"] < 0.7 * askew["difference"]["rms"]
+    for side in ("a", "b"):
+        assert facts[side]["sources"]["pose of the part"] > 0
+        assert any("registered by" in note for note in facts[side]["notes"])
+
+
 def test_it_speaks_to_people(results, tmp_path, capsys):
     pair = (str(results["slow"]), str(results["fast"]))
     assert main(["difference", *pair, "--out", str(tmp_path / "d")]) == DONE
@@ -134,6 +157,8 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
         (["--uncertainty", "-1"], "standard uncertainty"),
         (["--nominal", "missing.yaml"], "no surface at 'missing.yaml'"),
         (["--spacing", "1e-9"], "widen it"),
+        (["--register", "auto"], "--register needs the surface"),
+        (["--register", "roll"], "roll"),
     ],
 )
 def test_a_wrong_wish_is_one_line(results, tmp_path, capsys, arguments, told):

@@ -10,6 +10,7 @@ against either.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from omsm_ros.core.comparison.agreement import Errors, shapes_of_difference
 from omsm_ros.core.comparison.error_shapes import drift, likely_drift, unknown_form
 from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
-from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 
@@ -28,6 +28,20 @@ AT_ONCE, STATED, ESTIMATED, NOT_KNOWN = (
 
 # Errors of one number of the calibration, whose sign is the same in every scan.
 _OF_THE_CALIBRATION = ("lateral_lag", "static_gain")
+
+
+class Fields(Protocol):
+    """What systematic errors do to points, as :class:`omsm_ros.core.correction.scan_fields` has it.
+
+    names: of the source of each field
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def at(self, first: int, count: int) -> FloatArray:
+        """Return the fields (s, count) [m] at the points from ``first`` on."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -41,14 +55,16 @@ class Measurement:
     drift: standard deviation of the drift at the end of the scan [m]; None: nobody states it,
         unless one of the fields is a drift
     calibration: what the points were corrected by; empty: not known
+    pose: what the pose that was taken off may be wrong by; None: none was
     """
 
     name: str
     points: MeasuredPoints
-    fields: ScanFields | None = None
+    fields: Fields | None = None
     common: float | None = None
     drift: float | None = None
     calibration: str = ""
+    pose: Fields | None = None
 
     @property
     def drift_from(self) -> str:
@@ -123,16 +139,24 @@ def _known(half: Half, matched: Matched, length: float) -> Errors | None:
 def _shapes(half: Half, matched: Matched, length: float) -> dict[str, FloatArray] | None:
     """Shapes by source, each (k, m) [m]; None if nobody states any."""
     m = half.measurement
+    pose = {} if m.pose is None else _carried(half, m.pose)
     if m.fields is not None:
-        rows = half.surface.carried(m.fields.at, half.x, half.y)
-        return {
-            name: rows[[k for k, own in enumerate(m.fields.names) if own == name]]
-            for name in dict.fromkeys(m.fields.names)
-        }
+        return {**_carried(half, m.fields), **pose}
     size = half.taken.stated if m.common is None else np.full(len(half.x), m.common)
     if not np.all(np.isfinite(size)):
         return None
-    return {UNKNOWN_FORM: unknown_form(matched.x, matched.y, size, length)}
+    return {UNKNOWN_FORM: unknown_form(matched.x, matched.y, size, length), **pose}
+
+
+def _carried(half: Half, fields: Fields) -> dict[str, FloatArray]:
+    """Fields of the points as shapes at the places, by source, each (k, m) [m]."""
+    if not fields.names:
+        return {}
+    rows = half.surface.carried(fields.at, half.x, half.y)
+    return {
+        name: rows[[k for k, own in enumerate(fields.names) if own == name]]
+        for name in dict.fromkeys(fields.names)
+    }
 
 
 def _drifts(

@@ -116,11 +116,11 @@ def _doubts(matched: Matched, found: Agreement) -> tuple[str, ...]:
     ]
     deviation = matched.without_fit(np.stack([matched.a, matched.b]))
     compared = float(np.max(root_mean_square(deviation)))
-    explained = 2 * float(root_mean_square(found.uncertainty))
-    if explained > compared:
+    least = min(term.expanded for term in found.terms)
+    if least > compared:
         doubts.append(
-            f"an uncertainty of {explained / NANOMETRE_M:.1f} nm (k = 2) is more than all that is "
-            f"compared, {compared / NANOMETRE_M:.1f} nm rms; measure with less"
+            f"the surest of all terms has an uncertainty of {least / NANOMETRE_M:.1f} nm, more "
+            f"than all that is compared, {compared / NANOMETRE_M:.1f} nm rms; measure with less"
         )
     return tuple(doubts)
 

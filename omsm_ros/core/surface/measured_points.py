@@ -47,8 +47,8 @@ class MeasuredPoints:
     def __len__(self) -> int:
         return len(self.x)
 
-    def part(self, place: BoolArray) -> MeasuredPoints:
-        """Return the points at ``place`` (n,)."""
+    def part(self, place: BoolArray | IntArray) -> MeasuredPoints:
+        """Return the points at ``place``: which of them (n,), or their numbers."""
         return MeasuredPoints(
             x=self.x[place],
             y=self.y[place],

@@ -61,7 +61,11 @@ def _expanded(figure: Mapping[str, Any]) -> str:
     spread = figure.get("uncertainty")
     if spread is None:
         return quantity(figure["value"], "m")
-    return f"{measured(figure['value'], 2 * spread, 'm')} (k = 2)"
+    value, expanded = figure["value"], 2 * spread
+    if abs(value) < expanded:
+        bound = quantity(max(value, 0.0) + expanded, "m")
+        return f"at most {bound} (k = 2); its uncertainty is larger than the figure itself"
+    return f"{measured(value, expanded, 'm')} (k = 2)"
 
 
 def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:

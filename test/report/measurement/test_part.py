@@ -66,6 +66,14 @@ def test_every_figure_comes_with_its_expanded_uncertainty():
     assert any(r.endswith("peak to valley 171 nm ± 60 nm (k = 2)") for r in reasons)
 
 
+def test_a_figure_below_its_uncertainty_is_a_bound():
+    lost = {"deviation": {"peak_to_valley": {"value": -1e-9, "uncertainty": 450e-9}}}
+    text = verdict_on_part(summary(), lost).reasons[0].replace("\u202f", " ")
+    assert "at most 900 nm (k = 2); its uncertainty is larger than the figure itself" in text
+    half = {"deviation": {"peak_to_valley": {"value": 100e-9, "uncertainty": 60e-9}}}
+    assert "at most 220 nm" in verdict_on_part(summary(), half).reasons[0].replace("\u202f", " ")
+
+
 def test_a_part_that_was_not_registered_says_so():
     raw = {"deviation": {"corrected": {"peak_to_valley": 1e-7, "rms_area_weighted": 1e-8}}}
     found = verdict_on_part(raw, {})
