@@ -31,13 +31,12 @@ _OF_THE_CALIBRATION = ("lateral_lag", "static_gain")
 
 
 class Fields(Protocol):
-    """What systematic errors do to points, as :class:`omsm_ros.core.correction.scan_fields` has it.
-
-    names: of the source of each field
-    """
+    """What systematic errors do to points, as a scan's ``ScanFields`` has it."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Name of the source of each field."""
+        ...
 
     def at(self, first: int, count: int) -> FloatArray:
         """Return the fields (s, count) [m] at the points from ``first`` on."""
