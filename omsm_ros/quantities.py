@@ -160,7 +160,10 @@ FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
 CONIC_CONSTANT = Quantity("conic constant", "", -1e4, 1e4, "0 is a sphere, -1 a paraboloid")
 # Of a term of a surface: with the greatest power and length its square stays finite.
 COEFFICIENT = Quantity("coefficient", "", -1e40, 1e40, "check its unit and its sign")
-TERM_ORDER = Quantity("power", "", 0, 40, "give a smaller one", whole=True)
+# Of a term over a disc: with the smallest disc and the highest order its square stays finite.
+TERM_SIZE = Quantity("coefficient", "m", -10.0, 10.0, "give it in metres")
+DISC_RADIUS = Quantity("radius of the disc", "m", 1e-4, 1e2, "give it in metres")
+TERM_ORDER = Quantity("power", "", 0, 20, "give a smaller one", whole=True)
 TURN = Quantity("angle", "rad", -3.15, 3.15, "give it in radians")
 SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
 PITCH = Quantity("pitch", "rad", -1.0, 1.0, "give it in radians")

@@ -9,6 +9,7 @@ from omsm_ros.core.surface.height_grid import GridSurface, HeightGrid
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, SHAPES
 from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
 from omsm_ros.errors import SurfaceError
+from omsm_ros.storage import surface_file
 from omsm_ros.storage.surface_file import load_surface
 
 TEXTS = {
@@ -71,8 +72,6 @@ def test_what_is_wrong_is_named(text, named, tmp_path):
 
 def test_every_shape_has_a_schema():
     """A record whose fields the reader does not understand would be found by a user."""
-    from omsm_ros.storage import surface_file
-
     for name, kind in SHAPES.items():
         with pytest.raises(SurfaceError, match="no_such"):
             surface_file.surface_of({"shape": name, "no_such": 1}, "it")
@@ -122,3 +121,25 @@ def test_what_is_no_map_is_refused(text, named, tmp_path):
     path.write_text(text)
     with pytest.raises(SurfaceError, match=named):
         load_surface(path)
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        {"shape": "xy_polynomial", "radius": 1e-4, "terms": [{"x": 20, "y": 20, "value": 10.0}]},
+        {"shape": "asphere", "radius": 1e-6, "even_terms": [1e40] * 20, "odd_terms": [1e40] * 20},
+        {"shape": "zernike", "radius": 1e-4, "coefficients": [10.0] * 400, "indexing": "noll"},
+        {"shape": "q_bfs", "aperture_radius": 1e-4, "coefficients": [10.0] * 20, "radius": 1e5},
+        {"shape": "q_con", "aperture_radius": 1e-4, "coefficients": [10.0] * 20},
+        {"shape": "toroid", "radius_x": 1e-6, "radius_y": 1e5, "conic_constant": -1e4},
+        {"shape": "biconic", "radius_x": 1e-6, "radius_y": -1e-6, "conic_x": 1e4, "conic_y": -1e4},
+        {"shape": "sphere", "radius": 1e-6, "pose": {"tip": 3.1}},
+        {"shape": "flat", "pose": {"tip": np.pi / 2}},
+    ],
+)
+def test_the_wildest_surface_that_is_accepted_does_not_overflow(description):
+    """Warnings are errors here: it has a number or none, on anything that a machine may span."""
+    x = np.array([0.0, 1e-3, -5.0, 10.0])
+    surface = surface_file.surface_of(description, "it")
+    for values in (surface.height(x, x[::-1]), *surface.gradient(x, x[::-1])):
+        assert not np.any(np.isinf(values))

@@ -14,12 +14,12 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.slopes import Gradient
 from omsm_ros.errors import SurfaceError
-from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS
+from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, Quantity
 
 MOST_TERMS = 20
 
 
-def checked_terms(values: tuple[float, ...], name: str) -> None:
+def checked_terms(values: tuple[float, ...], name: str, quantity: Quantity = COEFFICIENT) -> None:
     """Raise SurfaceError unless these are plausible coefficients, and not too many."""
     if len(values) > MOST_TERMS:
         raise SurfaceError(
@@ -27,7 +27,7 @@ def checked_terms(values: tuple[float, ...], name: str) -> None:
             "others, or describe the surface by a grid"
         )
     for place, value in enumerate(values):
-        COEFFICIENT.checked(value, SurfaceError, f"{name}[{place}]")
+        quantity.checked(value, SurfaceError, f"{name}[{place}]")
 
 
 def curvature_of(radius: float | None) -> float:

@@ -22,7 +22,7 @@ from omsm_ros.core.surface.zernike_terms import (
     zernike_values,
 )
 from omsm_ros.errors import SurfaceError
-from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, FOCAL_LENGTH, RADIUS, TERM_ORDER
+from omsm_ros.quantities import CONIC_CONSTANT, DISC_RADIUS, RADIUS, TERM_ORDER, TERM_SIZE
 
 MOST_ZERNIKES = 400
 
@@ -38,7 +38,7 @@ class XYTerm:
     def __post_init__(self) -> None:
         TERM_ORDER.checked(self.x, SurfaceError, "power of x")
         TERM_ORDER.checked(self.y, SurfaceError, "power of y")
-        COEFFICIENT.checked(self.value, SurfaceError, "value")
+        TERM_SIZE.checked(self.value, SurfaceError, "value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class XYPolynomial:
     terms: tuple[XYTerm, ...]
 
     def __post_init__(self) -> None:
-        FOCAL_LENGTH.checked(self.radius, SurfaceError, "radius")
+        DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
@@ -85,7 +85,7 @@ class ZernikeSurface:
     norm: Norm = "peak"
 
     def __post_init__(self) -> None:
-        FOCAL_LENGTH.checked(self.radius, SurfaceError, "radius")
+        DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
         if self.indexing not in NUMBERING:
             raise SurfaceError(f"indexing is {self.indexing!r}, expected one of {list(NUMBERING)}")
         if self.norm not in ("peak", "rms"):
@@ -97,7 +97,7 @@ class ZernikeSurface:
                 f"numbering {self.indexing!r}"
             )
         for place, value in enumerate(self.coefficients):
-            COEFFICIENT.checked(value, SurfaceError, f"coefficients[{place}]")
+            TERM_SIZE.checked(value, SurfaceError, f"coefficients[{place}]")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
@@ -209,7 +209,7 @@ class QCon:
 def _check_series(
     aperture_radius: float, radius: float | None, coefficients: tuple[float, ...]
 ) -> None:
-    FOCAL_LENGTH.checked(aperture_radius, SurfaceError, "aperture_radius")
+    DISC_RADIUS.checked(aperture_radius, SurfaceError, "aperture_radius")
     if radius is not None:
         RADIUS.checked(radius, SurfaceError)
-    checked_terms(coefficients, "coefficients")
+    checked_terms(coefficients, "coefficients", TERM_SIZE)
