@@ -42,6 +42,7 @@ _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 # Of one in a million points of Gaussian noise; texture has shorter tails.
 OUTLIER_SIGMAS = 5.0
 _SIGMA_OF_MAD = 1.4826
+_MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
 _LEAST_LIMIT_M = 1e-12
 
 
@@ -164,6 +165,15 @@ def _spread(values: FloatArray) -> float:
     return _SIGMA_OF_MAD * float(np.median(np.abs(values)))
 
 
+def _limit_of(residual: FloatArray, spread: float) -> float:
+    """Return the distance [m] from the smooth form beyond which a point is dust.
+
+    Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
+    """
+    common = float(np.quantile(np.abs(residual), 1 - _MOST_DUST))
+    return max(OUTLIER_SIGMAS * spread, _BEYOND_COMMON * common, _LEAST_LIMIT_M)
+
+
 def _coarse(
     surface: Surface,
     chosen: Portion,
@@ -278,7 +288,7 @@ class _Fit:
             found, _ = self.solved(sums)
             at, form = at.moved(self.names, found.step), found.form
             spread = _spread(residual - np.median(residual))
-            limit = max(OUTLIER_SIGMAS * spread, _LEAST_LIMIT_M)
+            limit = _limit_of(residual, spread)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             if turn > 3 and float(np.max(np.abs(found.step) * own)) < _SHARE_OF_SPREAD * spread:
                 break

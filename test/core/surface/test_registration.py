@@ -197,6 +197,16 @@ def test_dust_is_left_out():
     assert dusty.limit < 1e-7
 
 
+def test_steps_of_the_part_are_no_dust():
+    """A tenth of a flat stands 20 nm above the rest, and no noise hides it."""
+    x, y = spiral()
+    step = 20e-9 * ((np.arctan2(y, x) > 0) & (np.arctan2(y, x) < 0.2 * np.pi))
+    portion = Portion(x, y, step, np.empty((0, len(x))))
+    found = fitted(Flat(), portion, "piston,tip,tilt")
+    points = placed(Flat(), found.placement, portion)
+    assert np.mean(found.good(points)) > 0.95
+
+
 def test_a_systematic_source_moves_the_pose_by_what_it_says():
     """A height that is off by a plane: the tilt follows, and the uncertainty of it is that."""
     portion = scan(PAPER_MIRROR)
