@@ -12,6 +12,7 @@ from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, form_rows
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.surface.freedoms import AUTO
+from omsm_ros.jobs.compensate_form import COMPENSATION, compensate_form
 from omsm_ros.jobs.judge_form import judge_form
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
@@ -56,6 +57,40 @@ def _form(args: argparse.Namespace) -> Facts:
             source = out
         points = open_measurement(source, args.unit)
         return judge_form(points, surface, out, args.fit, args.aperture, filters)
+
+
+# ---------------------------------------------------------------------------- compensate
+
+
+def _declare_compensate(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("measured", type=Path, help="result folder, cloud or map")
+    sub.add_argument("--nominal", type=Path, required=True, metavar="SURFACE.yaml")
+    sub.add_argument(
+        "--low-pass",
+        type=number(quantities.SPACING),
+        required=True,
+        metavar="WAVELENGTH",
+        help="of which half is compensated [m]; what is finer stays",
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument("--unit", **UNIT)
+    declare_fit(sub, (AUTO,))
+
+
+def _compensate(args: argparse.Namespace) -> Facts:
+    surface = load_surface(args.nominal)
+    with result_folder(args.out, (COMPENSATION,)) as out:
+        points = open_measurement(args.measured, args.unit)
+        return compensate_form(points, surface, out, args.low_pass, args.fit, args.aperture)
+
+
+def _show_compensate(facts: Facts) -> None:
+    lengths = ("rms_before", "rms_after", "largest_offset", "largest_uncertainty", "low_pass")
+    rows = [(name.replace("_", " "), quantity(facts[name], "m")) for name in lengths]
+    rows += [("not evaluated", text) for text in facts["not_evaluated"]]
+    table(
+        [*rows, ("sign", facts["sign"]), ("written", f"{facts['file']}, {facts['places']} places")]
+    )
 
 
 # ------------------------------------------------------------------------------- surface
@@ -108,6 +143,13 @@ COMMANDS = (
         _declare_form,
         _form,
         lambda facts: table(form_rows(facts)),
+    ),
+    Command(
+        "compensate",
+        "offsets of the next cut, from the form that was measured",
+        _declare_compensate,
+        _compensate,
+        _show_compensate,
     ),
     Command(
         "surface",

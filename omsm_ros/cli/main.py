@@ -27,7 +27,7 @@ WORDS = {
     "omsm_ros.cli.measuring": ("predict", "correct"),
     "omsm_ros.cli.resolving": ("selfcal", "reversal", "latency"),
     "omsm_ros.cli.aligning": ("align",),
-    "omsm_ros.cli.forming": ("form", "surface"),
+    "omsm_ros.cli.forming": ("form", "compensate", "surface"),
     "omsm_ros.cli.identifying": ("identify", "validate"),
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare", "calset"),
     "omsm_ros.cli.starting": ("twin", "doctor"),

@@ -23,11 +23,14 @@ _ALPHA = float(np.sqrt(np.log(2) / np.pi))
 class Cells:
     """Means on cells, rows along y.
 
-    pitch: of the cells [m];  present: cells that have points (r, c)
+    x, y: middles of the columns (c,) and rows (r,) [m];  pitch: of the cells [m]
+    present: cells that have points (r, c)
     mean: of the deviations (r, c) [m], zero where there are none;  noise: of each mean (r, c) [m]
     effects: the same means of what each source of error does (e, r, c) [m]
     """
 
+    x: FloatArray
+    y: FloatArray
     pitch: float
     present: BoolArray
     mean: FloatArray
@@ -54,7 +57,14 @@ class Cells:
             return np.asarray((np.bincount(place, values, size) / divisor).reshape(shape))
 
         effects = [mean(effect) for effect in map_.effects]
+        starts = float(map_.x.min()), float(map_.y.min())
+        x, y = (
+            np.asarray(start + pitch * (np.arange(count) + 0.5), np.float64)
+            for start, count in zip(starts, reversed(shape), strict=True)
+        )
         return cls(
+            x=x,
+            y=y,
             pitch=pitch,
             present=(counts > 0).reshape(shape),
             mean=mean(map_.deviation),
@@ -68,6 +78,13 @@ class Cells:
         weight = rows @ self.present @ columns
         made = rows @ (images * self.present) @ columns
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) * self.present)
+
+    def smoothed_square(self, variance: FloatArray, cutoff: float) -> FloatArray:
+        """Return the variance (r, c) of independent cells after :meth:`smoothed`."""
+        rows, columns = (_weights(size, cutoff / self.pitch) for size in self.present.shape)
+        weight = rows @ self.present @ columns
+        made = rows**2 @ (variance * self.present) @ columns**2
+        return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) ** 2 * self.present)
 
 
 def _weights(size: int, cutoff: float) -> FloatArray:

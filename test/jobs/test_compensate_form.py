@@ -1,0 +1,76 @@
+"""One corrective cut, tried: what was too high is cut off, and only what is finer stays."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.interpolate import LinearNDInterpolator
+
+from omsm_ros.cli.main import main
+from omsm_ros.core.surface.freeforms import ZernikeSurface
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.storage.surface_file import load_surface
+
+RADIUS = 12.7e-3
+FORM = ZernikeSurface(RADIUS, (0, 0, 0, 40e-9, 0, 50e-9, 0, 15e-9, 20e-9))
+
+
+def error(x, y):
+    """Form that a cut can take away, and ripple that it cannot."""
+    return FORM.height(x, y) + 4e-9 * np.sin(2 * np.pi * np.hypot(x, y) / 0.8e-3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cut")
+    n = 30_000
+    r, angle = np.linspace(RADIUS, 0, n), np.linspace(0, 200 * np.pi, n)
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    noise = np.random.default_rng(1).normal(0, 1e-8, n)
+    height = PAPER_MIRROR.height(x, y) + error(x, y) + noise
+    np.savetxt(folder / "part.xyz", np.stack([x, y, height], axis=1), fmt="%.15g")
+    (folder / "mirror.yaml").write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    return folder
+
+
+def compensate(folder, out, *more):
+    words = ["compensate", folder / "part.xyz", "--nominal", folder / "mirror.yaml", "--unit", "m"]
+    words += ["--fit", "piston,tip,tilt", "--out", out, *more]
+    return main([str(word) for word in words])
+
+
+def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, tmp_path, capsys):
+    assert compensate(folder, tmp_path, "--low-pass", "0.004", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    table = np.loadtxt(tmp_path / "compensation.csv", delimiter=",", skiprows=1)
+    assert len(table) == facts["places"]
+    cut = LinearNDInterpolator(table[:, :2], table[:, 2])
+    x, y = np.random.default_rng(2).uniform(-0.65 * RADIUS, 0.65 * RADIUS, (2, 20_000))
+    before = error(x, y)
+    after = before + cut(x, y)
+    after = after - after.mean()
+    ripple = 4e-9 / np.sqrt(2)
+    assert np.std(before) > 5 * ripple
+    assert np.std(after) == pytest.approx(ripple, rel=0.35)
+    assert load_surface(folder / "mirror.yaml") == PAPER_MIRROR
+    # The noise of each cell is in what it expects to be left; before, squares of the terms add up.
+    assert ripple < facts["rms_after"] < 7e-9
+    assert facts["rms_before"] == pytest.approx(33e-9, rel=0.1)
+
+
+def test_the_stated_uncertainty_is_that_of_the_offsets(folder, tmp_path):
+    """Against what the filter makes of the form without noise: that of the noise alone."""
+    compensate(folder, tmp_path, "--low-pass", "0.004")
+    table = np.loadtxt(tmp_path / "compensation.csv", delimiter=",", skiprows=1)
+    x, y, offset, spread = table[np.hypot(table[:, 0], table[:, 1]) < 0.6 * RADIUS].T
+    off = offset + FORM.height(x, y)
+    assert np.std(off) < 4 * np.median(spread)
+    assert 1e-10 < np.median(spread) < 2e-9
+
+
+def test_a_low_pass_finer_than_the_points_is_refused(folder, tmp_path, capsys):
+    assert compensate(folder, tmp_path / "out", "--low-pass", "0.0001") == 2
+    assert "finer than the points tell" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
