@@ -110,6 +110,6 @@ class CorrectionState:
             silent = flow.silent(now)
             patience = max(_SILENCE_S, _SILENCE_SAMPLES * self._period[stream])
             if silent is None:
-                report.add(STALE, f"no {stream} has come yet")
+                report.add(STALE, f"no sample of {stream} yet")
             elif silent > patience:
-                report.add(STALE, f"no {stream} for {silent:.0f} s")
+                report.add(STALE, f"no sample of {stream} for {silent:.0f} s")

@@ -42,7 +42,7 @@ def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
     cell.processes.start("corrector", calibration=str(path))
-    until(cell, "corrector", STALE, "no axes has come yet")
+    until(cell, "corrector", STALE, "no sample of axes yet")
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
     messages = conversions.ros_messages()
 
@@ -66,7 +66,7 @@ def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
     assert cell.operator.value("corrector", "missing_distance") == lost
     pairs = iter(())
     cell.operator.destroy_timer(next(cell.operator.timers))
-    until(cell, "corrector", STALE, "no axes for")
+    until(cell, "corrector", STALE, "no sample of axes for")
 
 
 def test_two_of_a_kind_are_told_by_both(cell):
