@@ -90,6 +90,7 @@ def test_through_restarts_in_any_order(cell, two):
     Listener(cell).hears_only(second)
 
 
+@pytest.mark.soak
 def test_what_the_corrector_refuses_is_not_in_force(cell, two):
     first, foreign = two
     cell.processes.start("corrector", settings='{"number": 0}')

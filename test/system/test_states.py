@@ -97,6 +97,7 @@ def test_a_second_emulator_is_refused_and_the_first_keeps_its_port(cell):
     until(cell, "confocal_driver", STALE)
 
 
+@pytest.mark.soak
 def test_simulated_time_that_nobody_tells_is_told(cell):
     cell.processes.start("calibrator", use_sim_time=True, output=str(cell.folder / "cal.json"))
     until(cell, "calibrator", WARN, "nobody publishes /clock")
