@@ -15,7 +15,7 @@ from omsm_ros.twin.cell import blocks_of
 pytestmark = pytest.mark.timeout(180)
 
 SCAN = 20_000
-LAPSE = 4.0  # five seconds: as long as a node needs to start twice
+LAPSE = 2.0  # ten seconds: longer than a node needs to start again
 
 
 def start_scanning(cell, calibration):
