@@ -31,11 +31,12 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
     """
     if even:
         return np.ones(len(x))
-    turned = turns(x, y)
+    angle = np.unwrap(np.arctan2(y, x))
+    turned = _turns(angle)
     share = np.ones(len(x))
     if turned >= _LEAST_TURNS:
         group, area = _rings(x, y, turned)
-        share = _arcs(x, y)
+        share = _arcs(np.hypot(x, y), angle)
     else:
         group, area = _cells(x, y)
     whole = np.bincount(group, share, minlength=len(area))
@@ -45,10 +46,11 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
 
 def turns(x: FloatArray, y: FloatArray) -> float:
     """Return how many times the path gets around the origin."""
-    if len(x) < 2:
-        return 0.0
-    angle = np.unwrap(np.arctan2(y, x))
-    return float(abs(angle[-1] - angle[0]) / (2 * np.pi))
+    return _turns(np.unwrap(np.arctan2(y, x)))
+
+
+def _turns(angle: FloatArray) -> float:
+    return float(abs(angle[-1] - angle[0]) / (2 * np.pi)) if len(angle) else 0.0
 
 
 def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, FloatArray]:
@@ -61,14 +63,13 @@ def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, Float
     return np.minimum(ring, count - 1), np.ones(count)
 
 
-def _arcs(x: FloatArray, y: FloatArray) -> FloatArray:
+def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
     """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
-    angle = np.unwrap(np.arctan2(y, x))
     steps = np.minimum(np.abs(np.diff(angle)), _LARGEST_ARC)
-    covered = np.empty(len(x))
+    covered = np.empty(len(angle))
     covered[0], covered[-1] = steps[0], steps[-1]
     covered[1:-1] = (steps[1:] + steps[:-1]) / 2
-    return np.asarray(np.hypot(x, y) * covered, np.float64)
+    return np.asarray(radius * covered, np.float64)
 
 
 def _cells(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
