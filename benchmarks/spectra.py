@@ -183,8 +183,18 @@ def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[
                 continue
             if _crowded(whole, line.frequency, slow, place, resolution):
                 continue
-            off = min((abs(f.frequency - place) for f in folded.lines), default=np.inf)
-            yield axis, off / resolution
+            seen = [f.frequency for f in folded.lines]
+            seen.append(_seen_near(values[::every], every / rate, place))
+            yield axis, min(abs(f - place) for f in seen) / resolution
+
+
+def _seen_near(values: np.ndarray, period: float, place: float) -> float:
+    """Where the spectrum is largest within three bins of ``place`` [Hz]."""
+    padded = 16 * len(values)
+    frequency = np.fft.rfftfreq(padded, period)
+    power = abs(np.fft.rfft(values - values.mean(), padded))
+    near = abs(frequency - place) < 3 / (len(values) * period)
+    return float(frequency[near][np.argmax(power[near])])
 
 
 def _noise_of(values: np.ndarray, found) -> float:  # type: ignore[no-untyped-def]
