@@ -10,6 +10,8 @@ where that costs more than five nanometres on the paper's scan. With
 
 from __future__ import annotations
 
+import textwrap
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -154,14 +156,29 @@ def _page(found: Sequence[Outcome]) -> str:
         "paper's scan; σ is the largest error of the response over what is stated, from 0.1 Hz "
         "to where it is trusted.",
         "",
+        _summary(found),
+        "",
         "| disturbance | verdict | error [nm] | stated [nm] | σ | in its words |",
         "|---|---|---|---|---|---|",
     ]
     return "\n".join([*head, *(_line(o) for o in found)]) + "\n"
 
 
+def _summary(found: Sequence[Outcome]) -> str:
+    kinds = Counter(_verdict(o) for o in found)
+    counted = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    wrong = sum(o.wrong for o in found)
+    return (
+        f"{len(found)} tests: {counted}; accepted though more than {_GREATEST_SIGMAS:g} σ and "
+        f"{_GREATEST_ERROR_M / NANOMETRE_M:g} nm off: {wrong}."
+    )
+
+
+def _verdict(o: Outcome) -> str:
+    return "rejected" if o.verdict == REJECTED else o.verdict.split(",")[0]
+
+
 def _line(o: Outcome) -> str:
-    verdict = "rejected" if o.verdict == REJECTED else o.verdict.split(",")[0]
     error, stated = o.error / NANOMETRE_M, o.stated / NANOMETRE_M
-    words = o.why[:160].replace("|", "/")
-    return f"| {o.name} | {verdict} | {error:.1f} | {stated:.1f} | {o.sigmas:.1f} | {words} |"
+    words = textwrap.shorten(o.why.replace("|", "/"), 160, placeholder=" …")
+    return f"| {o.name} | {_verdict(o)} | {error:.1f} | {stated:.1f} | {o.sigmas:.1f} | {words} |"
