@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from enum import Enum
 from typing import Protocol
 
@@ -63,6 +65,37 @@ class DeviceReader:
         self._deliver = deliver
         self._note = note
         self._back_off = back_off
+        self._requests: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
+            queue.SimpleQueue()
+        )
+
+    def ask(self, request: Callable[[], None], patience: float) -> None:
+        """Have the reading thread do ``request`` to the device between two reads, and wait for it.
+
+        Raises what ``request`` raises; DeviceError where the device is not being read, or after
+        ``patience`` [s].
+        """
+        if self.state is not State.READING:
+            raise DeviceError(f"the device is not being read now: {self.trouble or 'it ended'}")
+        done: Future[None] = Future()
+        self._requests.put((request, done))
+        try:
+            done.result(patience)
+        except TimeoutError as err:
+            done.cancel()
+            raise DeviceError(f"the device did not do it within {patience:g} s") from err
+
+    def _do_requests(self) -> None:
+        while not self._requests.empty():
+            request, done = self._requests.get()
+            if not done.set_running_or_notify_cancel():
+                continue
+            try:
+                request()
+            except Exception as err:  # told to who asked
+                done.set_exception(err)
+            else:
+                done.set_result(None)
 
     def run(self, stop: threading.Event) -> None:
         """Read until ``stop``."""
@@ -82,6 +115,7 @@ class DeviceReader:
             self._device.open()
             self._connected()
             while not stop.is_set():
+                self._do_requests()
                 blocks = self._device.poll(_READ_S)
                 any_came |= bool(blocks)
                 self._hand_over(blocks)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 
+import pytest
+
 from omsm_ros.devices.blocks import BlockPair
 from omsm_ros.devices.reader import DeviceReader, State
 from omsm_ros.errors import DeviceError
@@ -113,3 +115,55 @@ def test_a_defect_while_the_device_is_let_go_does_not_end_the_reading() -> None:
     reader = DeviceReader(device, got.extend, lambda _: None, back_off=(1e-3, 4e-3))
     reader.run(stop)
     assert (device.closed, got, reader.connections) == (2, [BLOCK], 2)
+
+
+class Endless(Scripted):
+    """Polls without end, a millisecond each."""
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        self.stop.wait(1e-3)
+        return [BLOCK]
+
+
+def reading(device: Scripted, stop: threading.Event) -> tuple[DeviceReader, threading.Thread]:
+    reader = DeviceReader(device, lambda _: None)
+    thread = threading.Thread(target=reader.run, args=(stop,))
+    thread.start()
+    while reader.state is not State.READING:
+        stop.wait(1e-3)
+    return reader, thread
+
+
+def test_a_request_is_done_by_the_reading_thread() -> None:
+    stop = threading.Event()
+    reader, thread = reading(Endless(stop, [[]], [[]]), stop)
+    doers: list[threading.Thread] = []
+    reader.ask(lambda: doers.append(threading.current_thread()), 5.0)
+    assert doers == [thread]
+
+    def refuse() -> None:
+        raise DeviceError("the target is in range")
+
+    with pytest.raises(DeviceError, match="in range"):
+        reader.ask(refuse, 5.0)
+    assert reader.state is State.READING
+    stop.set()
+    thread.join()
+    with pytest.raises(DeviceError, match="not being read"):
+        reader.ask(refuse, 5.0)
+
+
+def test_a_request_that_is_never_done_is_given_up() -> None:
+    stop, held = threading.Event(), threading.Event()
+
+    class Stuck(Endless):
+        def poll(self, timeout: float) -> list[BlockPair]:
+            held.wait(10.0)
+            return []
+
+    reader, thread = reading(Stuck(stop, [[]], [[]]), stop)
+    with pytest.raises(DeviceError, match=r"within 0\.1 s"):
+        reader.ask(lambda: None, 0.1)
+    stop.set()
+    held.set()
+    thread.join()

@@ -69,3 +69,24 @@ def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
     (line,) = ended.stderr.strip().splitlines()
     assert "disturbances.yaml" in line
     assert "'latency' is unknown" in line
+
+
+def test_a_dark_reference_is_taken_where_the_probe_can(cell):
+    from omsm_ros.emulators.players import emulated
+
+    cell.start_emulator(device="chrocodile")
+    cell.start_driver(**({"device": "chrocodile"} | emulated("chrocodile").driver))
+    cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)
+    answer = cell.call(Trigger, "confocal_driver/dark_reference")
+    assert answer.success, answer.message
+    assert "identify anew" in answer.message
+    assert cell.operator.value("confocal_driver", "connections") == 1
+
+
+def test_a_probe_without_that_command_says_so(cell):
+    cell.start_emulator()
+    cell.start_driver()
+    cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)
+    answer = cell.call(Trigger, "confocal_driver/dark_reference")
+    assert not answer.success
+    assert "takes no dark reference" in answer.message
