@@ -26,6 +26,7 @@ FASTEST = 100.0
 # A hundredth of a per cent, of the speed or of what it is allowed.
 _PRECISION = 1e-4
 _TINY = 1e-12
+_SAME_PERIOD = 1e-9
 # What the samples hold above it is the encoder's noise rather than the path.
 _CONTENT_SHARE = 0.999
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
@@ -80,30 +81,46 @@ class ScanPath:
 
 
 class PathStart:
-    """The first samples of a path, gathered from the blocks of a stream while they pass."""
+    """The first samples of a path, gathered from the blocks of a stream while they pass.
+
+    Across a gap in the counter, or to another sample period, no motion is known: the path is the
+    longest run without either.
+    """
 
     def __init__(self, most: int) -> None:
         """``most`` samples of either stream are kept."""
         self._most = most
-        self._axes: list[AxisBlock] = []
-        self._readings: list[FloatArray] = []
+        self._runs: list[list[AxisBlock]] = []
+        self._kept = self._readings_kept = 0
+        self._readings: list[tuple[int, FloatArray]] = []
 
     def add(self, block: Block) -> None:
         """Take what is still wanted of ``block``."""
-        if isinstance(block, AxisBlock) and sum(map(len, self._axes)) < self._most:
-            self._axes.append(block)
-        elif isinstance(block, DistanceBlock) and sum(map(len, self._readings)) < self._most:
-            self._readings.append(np.where(block.ok, block.distance, np.nan))
+        if isinstance(block, AxisBlock) and self._kept < self._most:
+            if not self._runs or not _continues(self._runs[-1][-1], block):
+                self._runs.append([])
+            self._runs[-1].append(block)
+            self._kept += len(block)
+        elif isinstance(block, DistanceBlock) and self._readings_kept < self._most:
+            readings = np.where(block.ok, block.distance, np.nan)
+            self._readings.append((block.first_sample, readings))
+            self._readings_kept += len(block)
 
     def path(self) -> ScanPath | None:
         """Return the path gathered so far; None if there were no axes."""
-        if not self._axes:
+        if not self._runs:
             return None
-        z, x, c = (
-            np.concatenate([getattr(b, name) for b in self._axes])[: self._most] for name in "zxc"
-        )
-        distance = np.concatenate(self._readings)[: self._most] if self._readings else None
-        return ScanPath(z=z, sample_period=self._axes[0].sample_period, x=x, c=c, distance=distance)
+        run = max(self._runs, key=lambda run: sum(map(len, run)))
+        z, x, c = (np.concatenate([getattr(b, name) for b in run])[: self._most] for name in "zxc")
+        first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
+        within = [readings for at, readings in self._readings if first <= at < end]
+        distance = np.concatenate(within)[: self._most] if within else None
+        return ScanPath(z=z, sample_period=run[0].sample_period, x=x, c=c, distance=distance)
+
+
+def _continues(last: AxisBlock, block: AxisBlock) -> bool:
+    same_period = abs(block.sample_period / last.sample_period - 1) < _SAME_PERIOD
+    return same_period and block.first_sample == last.first_sample + len(last)
 
 
 @dataclass(frozen=True, slots=True)

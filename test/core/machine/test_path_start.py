@@ -1,0 +1,58 @@
+"""The path that is judged has no gap and one sample period."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from omsm_ros.core.machine.limits import PathStart
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+
+TIME = np.arange(1000) * 1e-3
+Z = 1e-4 * np.sin(2 * np.pi * 2.0 * TIME)
+
+
+def axes(first: int, stop: int) -> AxisBlock:
+    zeros = np.zeros(stop - first)
+    channels = {"x": zeros, "y": zeros, "z": Z[first:stop], "b": zeros, "c": zeros}
+    return AxisBlock(stamp_ns=first * 10**6, first_sample=first, sample_period=1e-3, **channels)
+
+
+def distance(first: int, stop: int) -> DistanceBlock:
+    return DistanceBlock(
+        stamp_ns=first * 10**6, first_sample=first, sample_period=1e-3, distance=-Z[first:stop]
+    )
+
+
+def path_of(*blocks: AxisBlock | DistanceBlock, most: int = 10_000):
+    start = PathStart(most)
+    for block in blocks:
+        start.add(block)
+    return start.path()
+
+
+def test_blocks_that_continue_each_other_are_one_path() -> None:
+    found = path_of(axes(0, 100), distance(0, 100), axes(100, 250), distance(100, 250))
+    np.testing.assert_array_equal(found.z, Z[:250])
+    np.testing.assert_array_equal(found.distance, -Z[:250])
+
+
+def test_the_longest_run_is_taken_where_there_is_a_gap() -> None:
+    """Joined over the gap, z would jump by the motion of the samples that are missing."""
+    found = path_of(axes(0, 100), distance(0, 100), axes(220, 900), distance(220, 900))
+    np.testing.assert_array_equal(found.z, Z[220:900])
+    np.testing.assert_array_equal(found.distance, -Z[220:900])
+
+
+def test_another_period_is_another_path() -> None:
+    last = replace(axes(600, 700), sample_period=2e-3)
+    found = path_of(axes(0, 600), last)
+    assert found.sample_period == 1e-3
+    np.testing.assert_array_equal(found.z, Z[:600])
+
+
+def test_no_more_is_kept_than_asked_for() -> None:
+    found = path_of(axes(0, 100), axes(100, 200), axes(200, 900), most=150)
+    np.testing.assert_array_equal(found.z, Z[:150])
+    assert path_of(distance(0, 10)) is None
