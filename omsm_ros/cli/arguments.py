@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import Quantity, shown
 from omsm_ros.storage import strict_json
+from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
 
 class UsageError(ConfigurationError):
@@ -45,3 +47,30 @@ def json_object(text: str) -> dict[str, object]:
         return strict_json.object_of(text, ConfigurationError, shown(text))
     except ConfigurationError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def add_cell(sub: argparse.ArgumentParser) -> None:
+    """Add the options that say which topics of a bag are the cell's."""
+    sub.add_argument(
+        "--namespace", default="", metavar="/CELL", help="of the cell, in a bag of several"
+    )
+    sub.add_argument(
+        "--topics",
+        type=_topics,
+        default={},
+        metavar="axes=/x/axes,…",
+        help="what the bag calls topics of the cell, where otherwise than it would by itself",
+    )
+
+
+def _topics(text: str) -> dict[str, str]:
+    known = {relative(topic): topic for topic in TOPIC_TYPES}
+    found = dict(part.partition("=")[::2] for part in text.split(","))
+    if wrong := [name for name, topic in found.items() if name not in known or not topic]:
+        raise argparse.ArgumentTypeError(f"{wrong!r}: expected NAME=/TOPIC with one of {[*known]}")
+    return {known[name]: topic for name, topic in found.items()}
+
+
+def cell_of(path: Path, args: argparse.Namespace) -> AnyBag:
+    """Return the bag at ``path``, with the cell that was asked for of :func:`add_cell`."""
+    return CellBag(path, args.namespace, args.topics) if args.namespace or args.topics else path

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.arguments import add_cell, cell_of, json_object, number
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
@@ -34,6 +34,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "recording", type=Path, help="a bag of a motion on a fixed target, or a table RECORD.csv"
     )
+    add_cell(sub)
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
         "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
@@ -83,7 +84,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         return _model_facts(record, args)
     with progress_bar("reading", args.json) as progress:
         motion = motion_of_bag(
-            args.recording,
+            cell_of(args.recording, args),
             duration=args.duration,
             time_lapse=(args.settings or {}).get("time_lapse", 1.0),
             progress=progress,

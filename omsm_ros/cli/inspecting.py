@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from omsm_ros.cli.arguments import add_cell, cell_of
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path)
+    add_cell(sub)
     sub.add_argument(
         "--repair",
         action="store_true",
@@ -22,7 +24,7 @@ def _act(args: argparse.Namespace) -> Facts:
     if args.repair:
         return _repaired(args.bag)
     with progress_bar("reading", args.json) as progress:
-        found: Inspection = inspect_bag(args.bag, progress)
+        found: Inspection = inspect_bag(cell_of(args.bag, args), progress)
     return {"bag": str(args.bag), **found.entry()}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.arguments import add_cell, cell_of, json_object, number
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
@@ -52,6 +52,7 @@ def geometry_of(path: Path | None) -> Geometry:
 
 def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("bag", type=Path)
+    add_cell(sub)
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
@@ -134,7 +135,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         progress_bar("correcting", args.json) as progress,
     ):
         summary = measure(
-            args.bag,
+            cell_of(args.bag, args),
             calibration,
             out,
             nominal=nominal,

@@ -26,6 +26,7 @@ from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, d
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
 from omsm_ros.storage.cloud_file import PlyWriter
+from omsm_ros.storage.recording.topics import AnyBag
 
 # No picture has so many pixels; the numbers of a summary come from all points.
 MOST_DRAWN = 2**19
@@ -61,7 +62,7 @@ class Correction:
 
 
 def correct_bag(
-    path: Path,
+    path: AnyBag,
     calibration: Calibration,
     cloud: Path,
     *,

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -21,6 +20,7 @@ from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.topics import AnyBag
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 # A quarter of a gigabyte: one stream may be recorded that far ahead of the other.
@@ -64,7 +64,7 @@ class CorrectedScan:
 
     def __init__(
         self,
-        path: Path,
+        path: AnyBag,
         calibration: Calibration,
         options: CorrectionOptions,
         *,

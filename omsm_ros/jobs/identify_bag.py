@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.stamped_period import check_period
@@ -11,12 +9,13 @@ from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.topics import AnyBag
 
 # ------------------------------------------------------------------------ identification
 
 
 def motion_of_bag(
-    path: Path,
+    path: AnyBag,
     *,
     duration: float = 0.0,
     time_lapse: object = 1.0,

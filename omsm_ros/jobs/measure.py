@@ -30,6 +30,7 @@ from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.judge_scan import Judgement, with_sources
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, save_json
+from omsm_ros.storage.recording.topics import AnyBag
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Registering:
 
 
 def measure(
-    bag: Path,
+    bag: AnyBag,
     calibration: Calibration,
     out: Path,
     *,
@@ -129,7 +130,7 @@ def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Reg
 
 
 def summarise(
-    bag: Path, done: Correction, calibration: Calibration, judgement: Judgement
+    bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
 ) -> dict[str, Any]:
     """What ``summary.json`` says of every measurement; lengths in metres."""
     summary: dict[str, Any] = {

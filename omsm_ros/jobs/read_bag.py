@@ -9,6 +9,7 @@ from omsm_ros.core.machine.limits import PathStart, ScanPath
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.topics import AnyBag
 
 MOST_JUDGED = 2**20
 """Samples of a path that are judged: a quarter of an hour at 1 kHz, of a spiral the fastest."""
@@ -22,7 +23,7 @@ def no_progress(done: int, total: int) -> None:
 
 
 def read_blocks(
-    path: Path, topics: Sequence[str], progress: Progress = no_progress
+    path: AnyBag, topics: Sequence[str], progress: Progress = no_progress
 ) -> dict[str, list[Block]]:
     """All blocks on ``topics``, by topic; BagError if one of the topics is not there."""
     found: dict[str, list[Block]] = {topic: [] for topic in topics}

@@ -39,6 +39,7 @@ from omsm_ros.storage.recording.topics import (
     POINTS_TOPIC,
     REFERENCE_TOPIC,
     TOPIC_TYPES,
+    AnyBag,
     CellBag,
 )
 
@@ -65,7 +66,6 @@ BLOCK_TOPICS = frozenset(_BLOCKS)
 # at 8 MB, 2.7 s at 16 MB).
 _JOINED_BYTES = 8_000_000
 
-AnyBag: TypeAlias = "Path | str | CellBag"
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
 
 

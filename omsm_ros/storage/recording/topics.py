@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 AXES_TOPIC = "/omsm/axes"
 DISTANCE_TOPIC = "/omsm/confocal"
@@ -70,6 +71,9 @@ class CellBag:
             n for n, kind in held.items() if relative(n) == last and kind == TOPIC_TYPES[topic]
         ]
         return alike[0] if topic not in held and len(alike) == 1 else topic
+
+
+AnyBag: TypeAlias = "Path | str | CellBag"
 
 
 def relative(topic: str) -> str:
