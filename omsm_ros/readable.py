@@ -16,6 +16,11 @@ _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _WITHOUT_PREFIX = {"", "%", "°", "ppm", "kg", "rpm"}
 # A value far smaller than its uncertainty, or far larger, gets no absurd row of digits.
 _MOST_DECIMALS = 9
+_FIGURES = {
+    "robust_peak_to_valley": "PV of 99.5 %",
+    "peak_to_valley": "PV",
+    "iso10110": "ISO 10110",
+}
 _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -60,7 +65,31 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
     exponent = _exponent(max(abs(known), spread), unit)
     decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
-    return " ± ".join(f"{part / 10.0**exponent:.{decimals}f}{tail}" for part in (known, spread))
+    # What rounds to zero has no sign: adding 0 to -0 gives 0.
+    shown = (round(part / 10.0**exponent, decimals) + 0.0 for part in (known, spread))
+    return " ± ".join(f"{part:.{decimals}f}{tail}" for part in shown)
+
+
+def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = False) -> str:
+    """Return a value and its expanded uncertainty: ``10.9 nm ± 4.5 nm (k = 2)``.
+
+    uncertainty: standard;  signed: the value may be negative. Of one that may not, and is less
+    than its expanded uncertainty, the bound is all that is known: ``at most 32.0 nm (k = 2)``
+    """
+    known, spread = number(value), number(uncertainty)
+    if known is None or not spread:
+        return measured(value, None, unit, 3)
+    if signed or abs(known) >= 2 * spread:
+        return f"{measured(value, 2 * spread, unit)} (k = 2)"
+    most = max(known, 0.0) + 2 * spread
+    return f"at most {quantity(most, unit) if unit else plain(most)} (k = 2)"
+
+
+def figure(name: str) -> str:
+    """Return how a figure of a form is called: ``PV of 99.5 %``, ``rms of points``."""
+    for field, word in _FIGURES.items():
+        name = name.replace(field, word)
+    return name.replace("_", " ")
 
 
 def plain(value: object, digits: int = 3) -> str:

@@ -13,6 +13,8 @@ from omsm_ros.readable import (
     NOTHING,
     chance,
     count,
+    expanded,
+    figure,
     measured,
     number,
     percent,
@@ -48,6 +50,27 @@ FACTORS = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
 )
 def test_reads_as_it_should(value, uncertainty, unit, expected):
     assert measured(value, uncertainty, unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "signed", "expected"),
+    [
+        (10.9e-9, 2.23e-9, False, "10.9 nm ± 4.5 nm (k = 2)"),
+        (1.0e-9, 8.4e-9, False, "at most 17.8 nm (k = 2)"),
+        (-0.1e-9, 8.4e-9, False, "at most 16.8 nm (k = 2)"),
+        (-0.1e-9, 8.4e-9, True, "0 nm ± 17 nm (k = 2)"),
+        (10.9e-9, None, False, "10.9 nm"),
+        (None, 1e-9, False, "–"),
+    ],
+)
+def test_of_what_cannot_be_negative_a_bound_is_told(value, uncertainty, signed, expected):
+    assert expanded(value, uncertainty, "m", signed) == expected
+
+
+def test_a_figure_has_one_name():
+    assert figure("robust_peak_to_valley") == "PV of 99.5 %"
+    assert figure("peak_to_valley_without_second_order") == "PV without second order"
+    assert figure("iso10110_RMSi") == "ISO 10110 RMSi"
 
 
 @given(

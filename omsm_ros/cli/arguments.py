@@ -18,11 +18,17 @@ class UsageError(ConfigurationError):
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Refuses in one line instead of repeating how it is used."""
+    """Refuses in one line instead of repeating how it is used.
+
+    word: the command whose help is of use, where the parser of all commands refuses
+    """
+
+    word = ""
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError instead of printing and exiting."""
-        raise UsageError(f"{message}; see '{self.prog} --help'")
+        words = " ".join(filter(None, (self.prog, self.word)))
+        raise UsageError(f"{message}; see '{words} --help'")
 
 
 def number(quantity: Quantity) -> Callable[[str], Any]:

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
+from omsm_ros.cli.catalogue_option import ADDRESS, declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.jobs.run_campaign import DONE, Entry, load_summary, run_campaign
 from omsm_ros.storage.calibration_file import load_calibration
@@ -31,17 +32,25 @@ def _declare_batch(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--scheduler", default="", metavar="URL", help="of Dask: tcp:// here, or tls://"
     )
+    declare_catalogue(sub)
     sub.epilog = "Options of 'omsm correct' for every bag stand at the end, after '--'."
 
 
 def _batch(args: argparse.Namespace) -> Facts:
     with progress_bar("correcting", args.json, " bags") as progress:
         entries = run_campaign(
-            args.folder, args.calibration, args.out, args.passed_on,
+            args.folder, args.calibration, args.out, _options(args),
             jobs=args.jobs, scheduler=args.scheduler, progress=progress,
         )  # fmt: skip
     _write_index(args.out, args.folder.name, entries, args.calibration)
     return {"out": str(args.out), "entries": [asdict(entry) for entry in entries]}
+
+
+def _options(args: argparse.Namespace) -> list[str]:
+    """Of every correction; what the environment says, it reads for itself."""
+    if args.catalogue == os.environ.get(ADDRESS, ""):
+        return list(args.passed_on)
+    return [*args.passed_on, "--catalogue", args.catalogue]
 
 
 def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path) -> None:

@@ -19,10 +19,10 @@ from omsm_ros.jobs.compare_measurements import (
     compare_measurements,
     write_difference,
 )
+from omsm_ros.readable import count, figure, percent, plain, quantity
 from omsm_ros.storage.files import REPORT
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
-from omsm_ros.units import NANOMETRE_M
 
 # ---------------------------------------------------------------------------- difference
 
@@ -104,25 +104,29 @@ def _show_difference(facts: Facts) -> None:
     rows += [("because", text) for text in facts["reasons"]]
     rows += [("but", text) for text in facts["reservations"]]
     rows += [
-        ("difference", f"{_nm(found['peak_to_valley'])} PV, "
-                       f"{_nm(found['robust_peak_to_valley'])} PV of 99.5 %, "
-                       f"{_nm(found['rms'])} rms"),
+        ("difference", f"{_length(found['peak_to_valley'])} PV, "
+                       f"{_length(found['robust_peak_to_valley'])} PV of 99.5 %, "
+                       f"{_length(found['rms'])} rms"),
         ("uncertainty", "not evaluated" if found["uncertainty"] is None else
-                        f"{_nm(found['uncertainty'])} rms (k = 1)"),
-        ("places", f"{found['places']} of {facts['resampling']['spacing'] * 1e3:.3g} mm, "
-                   f"{100 * found['shared_area']:.0f} % of the smaller area"),
+                        f"{_length(found['uncertainty'])} rms (k = 1)"),
+        ("places", f"{count(found['places'])} of {_length(facts['resampling']['spacing'])}, "
+                   f"{percent(found['shared_area'], 3)} of the smaller area"),
     ]  # fmt: skip
     for name, n in facts["e_n"].items():
-        told = "not evaluated" if n["e_n"] is None else f"{n['e_n']:.2f} (U {_nm(n['expanded'])})"
-        label = f"E_n of {name.replace('_', ' ')}"
-        rows.append((label, f"{told}: {_nm(n['a'])} and {_nm(n['b'])}"))
+        told = (
+            "not evaluated"
+            if n["e_n"] is None
+            else f"{plain(n['e_n'])} (U {_length(n['expanded'])})"
+        )
+        label = f"E_n of {figure(name)}"
+        rows.append((label, f"{told}: {_length(n['a'])} and {_length(n['b'])}"))
     if facts["within"] is not None:
-        rows.append(("points", f"|E_n| < 1 on {100 * facts['within']:.1f} % of the area"))
+        rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
     table([*rows, ("written", ", ".join(facts["files"].values()))])
 
 
-def _nm(value: float) -> str:
-    return f"{value / NANOMETRE_M:.4g} nm"
+def _length(value: float) -> str:
+    return quantity(value, "m", 4)
 
 
 COMMANDS = (

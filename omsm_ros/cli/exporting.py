@@ -11,8 +11,8 @@ from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts, table
 from omsm_ros.errors import FileError
 from omsm_ros.jobs.export_points import export
+from omsm_ros.readable import count, quantity
 from omsm_ros.storage.maps.length_units import LengthUnits, units_of
-from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
 
 
 def unit(text: str) -> LengthUnits:
@@ -52,16 +52,16 @@ def _export(args: argparse.Namespace) -> Facts:
 
 
 def _show_export(facts: Facts) -> None:
-    rows = [("points", str(facts["points"]))]
+    rows = [("points", count(facts["points"]))]
     if "resampling" in facts:
-        spacing = " × ".join(f"{part / MILLIMETRE_M:.4g}" for part in facts["spacing"])
+        spacing = " × ".join(quantity(part, "m", 4) for part in facts["spacing"])
         rows += [
-            ("map", f"{facts['columns']} × {facts['rows']} places of {spacing} mm, "
-                    f"{facts['missing']} without a height"),
+            ("map", f"{facts['columns']} × {facts['rows']} places of {spacing}, "
+                    f"{count(facts['missing'])} without a height"),
             ("resampling", facts["resampling"]),
-            ("its error", f"at most {facts['interpolation_error'] / NANOMETRE_M:.2g} nm rms"),
+            ("its error", f"at most {quantity(facts['interpolation_error'], 'm', 2)} rms"),
         ]  # fmt: skip
-    table([*rows, ("written to", facts["file"])])
+    table([*rows, ("written", facts["file"])])
 
 
 COMMANDS = (

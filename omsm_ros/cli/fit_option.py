@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import math
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
@@ -11,7 +11,7 @@ from omsm_ros.cli.command import Facts
 from omsm_ros.core.surface.freedoms import parsed_freedoms
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.readable import measured, quantity
+from omsm_ros.readable import count, expanded, figure, measured, quantity
 
 
 def freedoms(text: str) -> tuple[str, ...]:
@@ -66,28 +66,54 @@ def declare_tolerance(sub: argparse.ArgumentParser) -> None:
     )
 
 
-_UNITLESS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
+_OTHER_UNITS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
+_SIGNED = ("Ssk",)
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 
 def form_rows(facts: Facts) -> list[tuple[str, str]]:
     """Return what people read of a form."""
     removed, points = facts["removed"], facts["points"]
-    rows = [
-        (name, _figure(facts["pose"][name], _UNITS.get(name, "rad"))) for name in removed["fitted"]
-    ]
-    rows += [(f"{n} not fitted", why) for n, why in removed["not_determined"].items()]
+    rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [
-        (name.replace("_", " "), _figure(figure, _UNITLESS.get(name, "m")))
-        for name, figure in facts["deviation"].items()
+        (f"{n} not fitted", f"{why}{_followed(facts, n)}")
+        for n, why in removed["not_determined"].items()
     ]
-    others = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read")
-    rows += [("points", f"{points['read']} read: {others}")]
+    rows += [
+        (
+            figure(name),
+            expanded(
+                entry["value"], entry["uncertainty"], _OTHER_UNITS.get(name, "m"), name in _SIGNED
+            ),
+        )
+        for name, entry in facts["deviation"].items()
+    ]
+    others = ", ".join(
+        f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
+    )
+    rows += [("points", f"{count(points['read'])} read: {others}")]
     rows += [("note", text) for text in removed["notes"]]
     return rows + [("not evaluated", text) for text in removed["not_evaluated"]]
 
 
-def _figure(figure: dict[str, Any], unit: str) -> str:
-    if figure["uncertainty"] is None:
-        return quantity(figure["value"], unit)
-    return measured(figure["value"], figure["uncertainty"], unit)
+def _pose(facts: Facts, name: str) -> str:
+    """A freedom, its uncertainty as if those that are not determined were what they are held at."""
+    removed = facts["removed"]
+    shares = [
+        share[name]
+        for source, share in removed["pose_uncertainty"].items()
+        if source not in removed["not_determined"]
+    ]
+    stated = measured(facts["pose"][name]["value"], math.hypot(*shares), _UNITS.get(name, "rad"))
+    return f"{stated} (k = 1)"
+
+
+def _followed(facts: Facts, name: str) -> str:
+    """What moves with a freedom that the points do not determine, and leaves the form alone."""
+    removed = facts["removed"]
+    moves = ", ".join(
+        f"{other} ± {quantity(share, _UNITS.get(other, 'rad'), 2)}"
+        for other, share in removed["pose_uncertainty"].get(name, {}).items()
+    )
+    widest = quantity(facts["pose"][name]["uncertainty"], _UNITS.get(name, "rad"), 2)
+    return f"; ± {widest} of it would go with {moves}, at the same form" if moves else ""

@@ -17,7 +17,7 @@ from omsm_ros.jobs.judge_form import judge_form
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
 from omsm_ros.jobs.show_surface import Scan, show_surface
-from omsm_ros.readable import quantity
+from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC
 from omsm_ros.storage.machine_files import load_limits
@@ -57,6 +57,10 @@ def _form(args: argparse.Namespace) -> Facts:
             source = out
         points = open_measurement(source, args.unit)
         return judge_form(points, surface, out, args.fit, args.aperture, filters)
+
+
+def _show_form(facts: Facts) -> None:
+    table([*form_rows(facts), ("written", ", ".join((FORM, CURVES, DEVIATION)))])
 
 
 # ---------------------------------------------------------------------------- compensate
@@ -102,7 +106,7 @@ def _declare_surface(sub: argparse.ArgumentParser) -> None:
     radius, speed = number(quantities.STEP), number(quantities.SPEED)
     sub.add_argument("--radius", type=radius, required=True, help="of the disc [m]")
     sub.add_argument("--feed", type=radius, default=1e-4, help="of the spiral, a turn [m]")
-    sub.add_argument("--speed", type=speed, default=30.0, help="of the spindle [rpm]")
+    sub.add_argument("--rpm", type=speed, default=30.0, help="of the spindle")
     sub.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="as of omsm predict")
     sub.add_argument(
         "--probe-angle", type=number(quantities.TURN), help="to the normal, at which it reads [rad]"
@@ -112,7 +116,7 @@ def _declare_surface(sub: argparse.ArgumentParser) -> None:
 
 def _surface(args: argparse.Namespace) -> Facts:
     limits = load_limits(args.limits) if args.limits else MachineLimits()
-    scan = Scan(args.radius, args.feed, args.speed)
+    scan = Scan(args.radius, args.feed, args.rpm)
     facts = show_surface(load_surface(args.surface), scan, limits, args.probe_angle, args.out)
     return {"surface": str(args.surface), **facts}
 
@@ -122,16 +126,18 @@ _FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
 
 def _show_surface(facts: Facts) -> None:
     x, y = (quantity(part, "m") for part in facts["steepest_at"])
-    angle = f"{facts['steepest_angle'] / DEGREE_RAD:.3g}°"
+    angle = f"{plain(facts['steepest_angle'] / DEGREE_RAD)}°"
+    written = [("written", facts["figure"])] if "figure" in facts else []
     table(
         [
             ("peak to valley", quantity(facts["peak_to_valley"], "m")),
             ("steepest", f"{angle} at x = {x}, y = {y}"),
             ("probe", _FOLLOWS[facts["probe_can_follow"]]),
             ("axes", _FOLLOWS[facts["axes_can_follow"]]),
-            *((f"  {limit['name']}", f"{limit['value']:.3g} of {limit['allowed']:.3g} "
-               f"{limit['unit']}") for limit in facts["limits"]),
+            *((f"  {limit['name']}", f"{quantity(limit['value'], limit['unit'])} of "
+               f"{quantity(limit['allowed'], limit['unit'])}") for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"])),
+            *written,
         ]
     )  # fmt: skip
 
@@ -142,7 +148,7 @@ COMMANDS = (
         "register a cloud to its nominal surface and judge its form",
         _declare_form,
         _form,
-        lambda facts: table(form_rows(facts)),
+        _show_form,
     ),
     Command(
         "compensate",

@@ -23,7 +23,7 @@ from omsm_ros.jobs.identify_table import (
     run_of,
     save_run,
 )
-from omsm_ros.readable import count, percent, plain, quantity
+from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.model_file import load_model, save_model
 
@@ -164,9 +164,17 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "warnings": calibration.certificate.get("warnings", []),
         "order": len(calibration.dynamics.denominator) - 1,
         "low_frequency_delay": calibration.dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty": calibration.low_frequency_delay_uncertainty,
         "static_gain": calibration.static_gain,
+        "static_gain_uncertainty": calibration.certificate.get("static_gain_uncertainty"),
         "valid_up_to": calibration.valid_up_to,
     }
+
+
+def _stated(facts: Facts, name: str, unit: str) -> str:
+    spread = facts[f"{name}_uncertainty"]
+    text = measured(facts[name], spread, unit, 6)
+    return f"{text} ± unknown" if spread is None else f"{text} (k = 1)"
 
 
 def _show(facts: Facts) -> None:
@@ -183,9 +191,9 @@ def _show(facts: Facts) -> None:
         ]
     else:
         rows += [
-            ("low-frequency delay", quantity(facts["low_frequency_delay"], "s", 5)),
-            ("static gain", plain(facts["static_gain"], 6)),
-            ("valid up to", quantity(facts["valid_up_to"], "Hz", 4)),
+            ("lag of Z", _stated(facts, "low_frequency_delay", "s")),
+            ("static gain", _stated(facts, "static_gain", "")),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
         ]
     for kind in ("reasons", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts[kind]]

@@ -69,6 +69,7 @@ def parser_of(word: str) -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog="omsm", description="Identify, correct and judge recorded measurements."
     )
+    parser.word = word if any(word in words for words in WORDS.values()) else ""
     parser.add_argument("--version", action="version", version=__version__)
     words = parser.add_subparsers(required=True, metavar="command", dest="command")
     for command in _commands(word):

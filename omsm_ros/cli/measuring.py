@@ -17,7 +17,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.machine.limits import MachineLimits, ScanPath
+from omsm_ros.core.machine.limits import FASTEST, MachineLimits, ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.measure import Registering, measure
@@ -214,7 +214,7 @@ def _show_predict(facts: Facts) -> None:
                               f"{quantity(facts['rms'], 'm', 4)} rms"),
             ("left after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
             ("motion outside the band", percent(facts["outside_band_fraction"])),
-            ("may run faster by", f"{plain(facts['speed_factor'])}, bound by {facts['binding']}"),
+            ("may run faster by", f"{_times(facts['speed_factor'])}, bound by {facts['binding']}"),
             *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
             ("because", facts["message"]),
@@ -224,8 +224,12 @@ def _show_predict(facts: Facts) -> None:
 
 def _limit_text(limit: Mapping[str, Any]) -> str:
     value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
-    faster = plain(limit["speed_factor"])
-    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, {faster} times as fast"
+    faster = _times(limit["speed_factor"])
+    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, {faster} as fast"
+
+
+def _times(factor: float) -> str:
+    return f"{plain(factor)}{' or more' if factor >= FASTEST else ''} times"
 
 
 COMMANDS = (

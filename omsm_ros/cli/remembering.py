@@ -10,7 +10,7 @@ from typing import Any
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, table
 from omsm_ros.core.verification.trend import Trend
-from omsm_ros.readable import NOTHING, count, measured, quantity
+from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.storage.strict_json import unknown_as_null
 
 _DAY_S = 86_400.0
@@ -64,7 +64,7 @@ def _show_history(facts: Facts) -> None:
             print(
                 f"  {row['recorded_at'] or row['added_at']}  calibration {row['id'][:8]}  "
                 f"lag {measured(row['delay'], row['delay_uncertainty'], 's')}  "
-                f"gain {row['static_gain']:.6f}  {row['verdict']}"
+                f"gain {plain(row['static_gain'], 6)}  {row['verdict']}"
             )
         for row in machine["measurements"][-_SHOWN_ROWS:]:
             print(
@@ -90,7 +90,7 @@ def _drift(found: dict[str, float] | None, unit: str) -> str:
         return f"{NOTHING} (not evaluated: fewer than five, or no times)"
     drift = Trend(**found)
     low, high = (
-        quantity(s * _DAY_S, unit) if unit else f"{s * _DAY_S:.1e}" for s in (drift.low, drift.high)
+        quantity(s * _DAY_S, unit) if unit else plain(s * _DAY_S) for s in (drift.low, drift.high)
     )
     return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
 

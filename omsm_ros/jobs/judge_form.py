@@ -15,6 +15,7 @@ from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
 from omsm_ros.storage.maps.vertex_file import write_ply
 
+_LIKE_FORM = ("x", "y", "clocking")
 _NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
 
 
@@ -77,7 +78,7 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
                 for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
-            "notes": list(measured.notes),
+            "notes": [*measured.notes, *_advice(form)],
         },
         "aperture": {
             "radius": form.aperture.radius,
@@ -90,6 +91,20 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
         },
         "points": form.counts,
     }
+
+
+def _advice(form: Form) -> list[str]:
+    """What would say more, where the fit of a move leaves less of the form than it is sure of."""
+    moves = [n for n in form.registration.freedoms.fitted if n in _LIKE_FORM]
+    rms = form.deviation["rms"]
+    if not moves or rms.uncertainty is None or rms.value >= 2 * rms.uncertainty:
+        return []
+    names = " and ".join(moves)
+    return [
+        f"a move along {names} looks like form here, and was fitted, so that little is known of "
+        "form that looks so; if the part was not moved since it was cut, hold it: "
+        "--fit piston,tip,tilt"
+    ]
 
 
 def _curves(form: Form) -> dict[str, Any]:

@@ -186,6 +186,11 @@ def test_every_word_is_where_main_looks_for_it():
         assert tuple(c.name for c in importlib.import_module(module).COMMANDS) == words
 
 
+def test_the_help_of_the_command_is_named_where_its_arguments_are_wrong(capsys):
+    assert cli.main(["history", "--no-such-option"]) == 2
+    assert "see 'omsm history --help'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -11,6 +11,7 @@ from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.surface.freeforms import ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.readable import count
 from omsm_ros.storage.cloud_file import CloudFile, PlyWriter
 from omsm_ros.storage.fields_file import save_fields
 from omsm_ros.storage.files import CLOUD, SYSTEMATIC
@@ -107,7 +108,7 @@ def test_people_read_the_figures_too(folder, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "rms of points" in said
     assert "not evaluated" in said
-    assert f"{POINTS} read" in said
+    assert f"{count(POINTS)} read" in said
 
 
 @pytest.mark.parametrize(
@@ -181,3 +182,15 @@ def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
     found = json.loads((tmp_path / "out" / "form.json").read_text())
     assert found["points"]["read"] == len(cloud)
     assert found["pose"]["tip"]["value"] == pytest.approx(2e-3, abs=1e-7)
+
+
+def test_a_move_that_hides_the_form_is_advised_against(folder, tmp_path):
+    """Over a small disc a shift and astigmatism are one; held, the same points say much more."""
+    words = ("--aperture", RADIUS / 6)
+    notes = {}
+    for fit in ("auto", "piston,tip,tilt"):
+        _, path = form(folder, tmp_path / fit, "--fit", fit, *words)
+        told = json.loads(path.read_text())
+        notes[fit] = told["removed"]["notes"]
+    assert any("hold it: --fit piston,tip,tilt" in note for note in notes["auto"])
+    assert not any("hold it" in note for note in notes["piston,tip,tilt"])

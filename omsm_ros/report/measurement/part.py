@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from omsm_ros.readable import NOTHING, measured, plain, quantity
+from omsm_ros.readable import NOTHING, expanded, plain, quantity
 from omsm_ros.report.common.tables import Table, part
 from omsm_ros.report.common.verdict import Verdict
 
@@ -58,14 +58,9 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
 
 def _expanded(figure: Mapping[str, Any]) -> str:
     """A figure with its expanded uncertainty, k = 2."""
-    spread = figure.get("uncertainty")
-    if spread is None:
-        return quantity(figure["value"], "m")
-    value, expanded = figure["value"], 2 * spread
-    if abs(value) < expanded:
-        bound = quantity(max(value, 0.0) + expanded, "m")
-        return f"at most {bound} (k = 2); its uncertainty is larger than the figure itself"
-    return f"{measured(value, expanded, 'm')} (k = 2)"
+    text = expanded(figure["value"], figure.get("uncertainty"), "m")
+    larger = "; its uncertainty is larger than the figure itself"
+    return text + larger if text.startswith("at most") else text
 
 
 def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
