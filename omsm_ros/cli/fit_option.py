@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
@@ -11,7 +10,8 @@ from omsm_ros.cli.command import Facts
 from omsm_ros.core.surface.freedoms import parsed_freedoms
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.readable import count, expanded, figure, measured, quantity
+from omsm_ros.readable import count, expanded, figure, measured
+from omsm_ros.report.measurement.part import dragged, settled
 
 
 def freedoms(text: str) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
     removed, points = facts["removed"], facts["points"]
     rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [
-        (f"{n} not fitted", f"{why}{_followed(facts, n)}")
+        (f"{n} not fitted", f"{why}{dragged(facts, n)}")
         for n, why in removed["not_determined"].items()
     ]
     rows += [
@@ -97,23 +97,5 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
 
 
 def _pose(facts: Facts, name: str) -> str:
-    """A freedom, its uncertainty as if those that are not determined were what they are held at."""
-    removed = facts["removed"]
-    shares = [
-        share[name]
-        for source, share in removed["pose_uncertainty"].items()
-        if source not in removed["not_determined"]
-    ]
-    stated = measured(facts["pose"][name]["value"], math.hypot(*shares), _UNITS.get(name, "rad"))
-    return f"{stated} (k = 1)"
-
-
-def _followed(facts: Facts, name: str) -> str:
-    """What moves with a freedom that the points do not determine, and leaves the form alone."""
-    removed = facts["removed"]
-    moves = ", ".join(
-        f"{other} ± {quantity(share, _UNITS.get(other, 'rad'), 2)}"
-        for other, share in removed["pose_uncertainty"].get(name, {}).items()
-    )
-    widest = quantity(facts["pose"][name]["uncertainty"], _UNITS.get(name, "rad"), 2)
-    return f"; ± {widest} of it would go with {moves}, at the same form" if moves else ""
+    value, spread = facts["pose"][name]["value"], settled(facts, name)
+    return f"{measured(value, spread, _UNITS.get(name, 'rad'))} (k = 1)"

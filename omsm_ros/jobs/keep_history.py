@@ -157,6 +157,6 @@ def _recorded(bag: Path | None) -> int | None:
         if bag is None or not bag.exists():
             return None
         with bags.BagReader(bag) as reader:
-            return reader.start_ns
+            return reader.recorded_ns
     except (FileError, OSError):
         return None

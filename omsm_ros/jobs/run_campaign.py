@@ -228,7 +228,7 @@ def _is_done(entry: Entry | None, task: Task, out: Path) -> bool:
 def _recorded(path: str) -> int | None:
     try:
         with bags.BagReader(path) as bag:
-            return bag.start_ns
+            return bag.recorded_ns
     except FileError:
         return None
 

@@ -69,7 +69,9 @@ class Catalogue:
         known = self._tables["calibrations"].metadata
         try:
             known.create_all(self._engine, checkfirst=True)
-        except (self._sql.exc.ProgrammingError, self._sql.exc.IntegrityError):
+        except self._sql.exc.DBAPIError as err:
+            if "already exists" not in str(err):
+                raise
             # Two who both find none make them at once; the slower one looks again.
             known.create_all(self._engine, checkfirst=True)
 

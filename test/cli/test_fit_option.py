@@ -42,7 +42,7 @@ def test_what_goes_with_a_freedom_that_is_not_determined_is_told_apart(facts):
     assert rows["tip"] == "1.0 µrad ± 5.0 µrad (k = 1)"
     assert rows["y"] == "22.0 µm ± 4.0 µm (k = 1)"
     told = rows["clocking not fitted"]
-    assert told.startswith("it does what tip and y do; ± 17 mrad of it would go with")
+    assert told.startswith("it does what tip and y do; clocking ± 17 mrad would go with")
     assert told.endswith("tip ± 17 mrad, y ± 900 µm, at the same form")
 
 

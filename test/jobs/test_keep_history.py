@@ -19,6 +19,7 @@ from omsm_ros.storage.recording.bag_writer import BagWriter
 
 pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
 DAY_NS = 86_400 * 10**9
+FIRST_NS = 1_767_225_600 * 10**9  # 2026-01-01
 
 
 @pytest.fixture
@@ -77,8 +78,8 @@ def test_a_row_holds_what_its_calibration_says(tmp_path, address, true_calibrati
 def _bag(path, day, block):
     axes, distance = block
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
-        bag.write_axes(dataclasses.replace(axes, stamp_ns=day * DAY_NS))
-        bag.write_distance(dataclasses.replace(distance, stamp_ns=day * DAY_NS))
+        bag.write_axes(dataclasses.replace(axes, stamp_ns=FIRST_NS + day * DAY_NS))
+        bag.write_distance(dataclasses.replace(distance, stamp_ns=FIRST_NS + day * DAY_NS))
     return path
 
 
@@ -92,12 +93,20 @@ def test_drift_of_a_machine_is_found_over_days(
         keep_calibration(address, calibration, tmp_path / f"{day}.json", bag)
     (machine,) = history(address, "lathe 1")
     assert [row["recorded_at"] for row in machine.calibrations] == [
-        datetime(1970, 1, day + 1) for day in range(8)
+        datetime(2026, 1, day + 1) for day in range(8)
     ]
     assert machine.delay.slope * 86_400 == pytest.approx(1e-6, rel=1e-6)
     assert machine.delay.significant
     assert machine.deviation is None
     assert history(address, "lathe 2") == []
+
+
+def test_a_clock_that_was_never_set_tells_no_time(tmp_path, small_scan_blocks):
+    """As of the twin, whose stamps count from zero: 1970 is when nothing was recorded."""
+    block = next(iter(small_scan_blocks))
+    for day, known in ((-FIRST_NS // DAY_NS, None), (0, FIRST_NS)):
+        with bags.BagReader(_bag(tmp_path / f"{day}.mcap", day, block)) as bag:
+            assert bag.recorded_ns == known
 
 
 WRITER = """

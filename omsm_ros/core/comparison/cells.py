@@ -10,6 +10,7 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
+from omsm_ros.readable import quantity
 
 _TREND_DEGREE = 6
 _TREND_POINTS = 20_000
@@ -90,8 +91,8 @@ def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
     extent = max(wide, high)
     if min(wide, high) <= 0:
         raise DataError(
-            f"the points cover {wide:.3g} × {high:.3g} m, which is no area; a profile cannot be "
-            "made into a map"
+            f"the points cover {quantity(wide, 'm')} × {quantity(high, 'm')}, which is no area; "
+            "a profile cannot be made into a map"
         )
     side = max(float(np.sqrt(wide * high / len(x))), extent / most)
     while extent / side > _FEWEST_CELLS_ACROSS:

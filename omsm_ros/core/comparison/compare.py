@@ -23,7 +23,7 @@ from omsm_ros.core.comparison.verdict import Verdict, verdict_of
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
-from omsm_ros.units import NANOMETRE_M
+from omsm_ros.readable import quantity
 
 MOST_ACROSS = 200
 """Places across the map of a difference."""
@@ -130,7 +130,7 @@ def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
         )
     counts = [int((h - c) / side) + 1 for c, h in zip(low, high, strict=True)]
     if max(counts) > 20 * MOST_ACROSS:
-        raise DataError(f"a spacing of {side:.3g} m makes {counts!r} places; widen it")
+        raise DataError(f"a spacing of {quantity(side, 'm')} makes {counts!r} places; widen it")
     x0, y0 = (c + (h - c) % side / 2 for c, h in zip(low, high, strict=True))
     return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
 
@@ -162,7 +162,7 @@ def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]
     if any(drifts):
         found = (
             f"nobody states the drift: what of the difference goes with the time of a scan, up to "
-            f"{max(drifts) / NANOMETRE_M:.1f} nm, is taken for it; a true difference of that form, "
+            f"{quantity(max(drifts), 'm', 2)}, is taken for it; a true difference of that form, "
             "as rings or power of a spiral scan, is not seen; state it, as --drift 20e-9",
         )
     sideways = [name for name in ("x", "y", "clocking") if name in matched.freedoms]

@@ -17,6 +17,7 @@ from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.readable import quantity
 
 FREEDOMS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
 """In this order; tip turns about y (height grows with x), tilt about x."""
@@ -142,8 +143,9 @@ class _Places:
         filled = np.isfinite(self._here.value) & np.isfinite(there.value)
         if np.sum(filled) < _FEWEST_PLACES:
             raise DataError(
-                f"the two measurements share {np.sum(filled)} places of {self._grid.dx:.3g} m, "
-                f"expected {_FEWEST_PLACES} or more; do they lie in one frame, and in one unit?"
+                f"the two measurements share {np.sum(filled)} places of "
+                f"{quantity(self._grid.dx, 'm')}, expected {_FEWEST_PLACES} or more; "
+                "do they lie in one frame, and in one unit?"
             )
         columns = {n: _column(n, u, v, there)[filled] for n in freedoms}
         heights = (self._here.value[filled], there.value[filled])
@@ -212,7 +214,8 @@ def _not_determined(columns: dict[str, FloatArray], place: float) -> dict[str, s
         if share < _LEAST_OWN_SHARE or effect < 1e-10:
             refused[name] = (
                 "the surface looks alike wherever it is: moved by "
-                f"{reach:.2g} {'rad' if name == 'clocking' else 'm'} it changes by {effect:.1g} m"
+                f"{quantity(reach, 'rad' if name == 'clocking' else 'm', 2)} it changes by "
+                f"{quantity(effect, 'm', 1)}"
             )
     return refused
 

@@ -21,6 +21,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
+from omsm_ros.readable import quantity
 
 Rows = Callable[[int, int], FloatArray]
 
@@ -75,8 +76,8 @@ class LocalQuadratic:
         )
         if len(self._cells.x) < _LEAST_NEIGHBOURS:
             raise DataError(
-                f"the points fill {len(self._cells.x)} cells of {cell:.3g} m, too few for a "
-                "surface between them; measure an area, or choose smaller cells"
+                f"the points fill {len(self._cells.x)} cells of {quantity(cell, 'm')}, too few for "
+                "a surface between them; measure an area, or choose smaller cells"
             )
         self._tree = cKDTree(np.column_stack([self._cells.x, self._cells.y]))
         some = slice(None, None, max(len(points) // _PROBED, 1))
@@ -251,7 +252,9 @@ def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> 
     side = spacing or cell_side(points.x, points.y, most)
     shape = tuple(int(np.floor(np.ptp(v) / side)) + 1 for v in (points.y, points.x))
     if max(shape) > max(most, 20_000) or shape[0] * shape[1] > 25_000_000:
-        raise DataError(f"a spacing of {side:.3g} m makes a map of {shape!r} places; widen it")
+        raise DataError(
+            f"a spacing of {quantity(side, 'm')} makes a map of {shape!r} places; widen it"
+        )
     x0, y0 = (float(v.min() + (np.ptp(v) % side) / 2) for v in (points.x, points.y))
     empty = HeightGrid(height=np.zeros(shape), x0=x0, y0=y0, dx=side, dy=side)
     x, y = (part.ravel() for part in np.meshgrid(empty.x, empty.y))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from omsm_ros.core.spectra.hypotheses import PART, SYNCHRONOUS, StudiedScan
 from omsm_ros.core.spectra.line import Line
 from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
-from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
+from omsm_ros.readable import quantity
 
 RATE = "an accelerometer, or a scan at another sampling rate, tells"
 _SAME_PACE = 0.02
@@ -22,17 +22,12 @@ def along(coordinate: str) -> str:
 
 def images(frequency: float, rate: float) -> str:
     """The lowest frequencies [Hz] beyond half of ``rate`` [Hz] that are seen at ``frequency``."""
-    return ", ".join(f"{f:.6g} Hz" for f in (rate - frequency, rate + frequency)) + ", …"
+    return ", ".join(hertz(f) for f in (rate - frequency, rate + frequency)) + ", …"
 
 
-def nanometres(length: float) -> str:
-    """A length [m] for people."""
-    return f"{length / NANOMETRE_M:.3g} nm"
-
-
-def micrometres(length: float) -> str:
-    """A length [m] for people."""
-    return f"{length / MICROMETRE_M:.4g} µm"
+def hertz(frequency: float) -> str:
+    """A frequency of a line: lines are told apart by their sixth digit."""
+    return quantity(frequency, "Hz", 6)
 
 
 def to_decide(scans: Sequence[StudiedScan], own: int, line: Line, kinds: set[str]) -> str:

@@ -43,6 +43,7 @@ from omsm_ros.core.spectra.line import Line, sum_of, texture, waves_of
 from omsm_ros.core.spectra.lines import LEAST_SIGMA, LineSpectrum, find_lines
 from omsm_ros.core.spectra.noise_floor import significance
 from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
+from omsm_ros.readable import count, quantity
 
 # What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
 _LEAST_FELT, _MOST_FELT = 0.1, 30.0
@@ -201,8 +202,8 @@ def _named(done: Settled, key: Key, evidence: Evidence) -> Named:
         second = _by_claim(done, key, also)
         text = (
             f"coincides here with a line that is {second.kind}: elsewhere this has "
-            f"{needs.nanometres(size_elsewhere(done, [claim]))}, "
-            f"the other {needs.nanometres(size_elsewhere(done, [also]))}"
+            f"{quantity(size_elsewhere(done, [claim]), 'm')}, "
+            f"the other {quantity(size_elsewhere(done, [also]), 'm')}"
         )
         own = replace(own, evidence=(*own.evidence, text), also=second.kind)
     one = _feeling(scan, line)
@@ -214,7 +215,7 @@ def _named(done: Settled, key: Key, evidence: Evidence) -> Named:
     size = size_elsewhere(done, [claim])
     if size > one.displacement and size > 0.5 * line.amplitude:
         return replace(own, evidence=(*own.evidence, *felt_as.evidence), also=felt_as.kind)
-    text = f"coincides here with {needs.nanometres(size)} {own.kind}"
+    text = f"coincides here with {quantity(size, 'm')} {own.kind}"
     return replace(felt_as, evidence=(*felt_as.evidence, text), also=own.kind)
 
 
@@ -230,7 +231,7 @@ def _by_claim(done: Settled, key: Key, claim: Claim) -> Named:
         return Named(line=line, kind=PART, evidence=(text,), wavelength=1 / h.frequency)
     if claim.kind == ARTEFACT:
         text = (
-            f"{where} resolves a texture of {needs.micrometres(1 / h.frequency)}, shorter than "
+            f"{where} resolves a texture of {quantity(1 / h.frequency, 'm', 4)}, shorter than "
             "twice the sampling distance here; its image is seen at this place"
         )
         return Named(line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / h.frequency)
@@ -250,8 +251,8 @@ def _shaken(done: Settled, key: Key, claim: Claim, where: str) -> Named:
     if not rates:
         text = f"the same frequency in {where}, at another speed over the part"
         return Named(line=line, kind=VIBRATION, evidence=(text, _or_image(line, rate)))
-    sampled = ", ".join(f"{r:g} Hz" for r in sorted(rates))
-    text = f"seen in {where}, sampled at {sampled}, where {h.frequency:.6g} Hz would be seen"
+    sampled = ", ".join(quantity(r, "Hz", 4) for r in sorted(rates))
+    text = f"seen in {where}, sampled at {sampled}, where {needs.hertz(h.frequency)} would be seen"
     kind = FOLDED if h.frequency > rate / 2 else VIBRATION
     return Named(line=line, kind=kind, evidence=(text,), frequency=h.frequency)
 
@@ -284,14 +285,15 @@ def _feeling(scan: StudiedScan, line: Line) -> FeltLine | None:
 def _by_feeling(scan: StudiedScan, line: Line, one: FeltLine) -> Named:
     rate = scan.signal.rate
     texts = [
-        f"the accelerometer feels {one.acceleration:.3g} m/s² along {one.axis} at "
-        f"{one.frequency:.6g} Hz ({one.significance:.0f} σ), {needs.nanometres(one.displacement)} "
+        f"the accelerometer feels {quantity(one.acceleration, 'm/s²')} along {one.axis} at "
+        f"{needs.hertz(one.frequency)} ({count(round(one.significance))} σ), "
+        f"{quantity(one.displacement, 'm')} "
         "of motion"
     ]
     folds = one.frequency > rate / 2
     if folds:
         seen = float(folded_frequency(one.frequency, rate))
-        texts.append(f"sampled at {rate:g} Hz it is seen at {seen:.6g} Hz")
+        texts.append(f"sampled at {quantity(rate, 'Hz', 4)} it is seen at {needs.hertz(seen)}")
     kind = FOLDED if folds else VIBRATION
     return Named(line=line, kind=kind, evidence=tuple(texts), frequency=one.frequency)
 
@@ -332,7 +334,7 @@ def _with_true_frequency(scans: Sequence[StudiedScan], named: dict[Key, Named], 
         if other == key[0] or row.frequency is None:
             continue
         if abs(float(folded_frequency(row.frequency, rate)) - seen) <= 1 / scan.signal.duration:
-            text = f"{scans[other].signal.name} tells its frequency: {row.frequency:.6g} Hz"
+            text = f"{scans[other].signal.name} tells its frequency: {needs.hertz(row.frequency)}"
             kind = FOLDED if row.frequency > rate / 2 else VIBRATION
             told = (own.evidence[0], text)
             return replace(own, kind=kind, frequency=row.frequency, evidence=told)

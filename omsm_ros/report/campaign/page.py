@@ -177,7 +177,10 @@ def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> by
         usual = ~one.outlying
         panel.plot(x[usual], one.values[usual] / NANOMETRE_M, ".", color=style.AFTER, markersize=5)
         panel.plot(x[one.outlying], one.values[one.outlying] / NANOMETRE_M, "o", color=style.BEFORE)
-        panel.set_ylim(bottom=0)
+        # A twentieth more than the largest, so that its dot is whole.
+        panel.set_ylim(0, 1.05 * (float(np.nanmax(one.values)) / NANOMETRE_M or 1.0))
+        if not timed:
+            panel.xaxis.get_major_locator().set_params(integer=True)
         style.label(panel, y="nm", title=one.series.name)
     style.label(axes[-1, 0], x="days since the first recording" if timed else "measurement")
     return style.png(made, dpi=120)

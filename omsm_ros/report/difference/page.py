@@ -10,7 +10,7 @@ import numpy as np
 from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR
 from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
+from omsm_ros.readable import NOTHING, count, figure, percent, plain, probability, quantity
 from omsm_ros.report.common import style
 from omsm_ros.report.common.tables import Table
 from omsm_ros.report.common.template import fill, picture
@@ -108,7 +108,7 @@ def records(facts: Mapping[str, Any]) -> list[Table]:
 def _numbers(facts: Mapping[str, Any]) -> Table:
     rows = [
         (
-            name.replace("_", " "),
+            figure(name),
             quantity(n["a"], "m", 5),
             quantity(n["b"], "m", 5),
             NOTHING if n["expanded"] is None else quantity(n["expanded"], "m"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -74,10 +75,36 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
     rows = []
     for name in part(form, "removed", "fitted") or ():
         pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
-        rows.append((name, _size(pose.get("value"), unit), _size(pose.get("uncertainty"), unit)))
+        rows.append((name, _size(pose.get("value"), unit), _size(settled(form, name), unit)))
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
-    rows += [(f"not {name}", str(why), NOTHING) for name, why in refused.items()]
+    rows += [
+        (f"not {name}", f"{why}{dragged(form, name)}", NOTHING) for name, why in refused.items()
+    ]
     return Table(title, columns, rows)
+
+
+def settled(form: Mapping[str, Any], name: str) -> float | None:
+    """Return the standard uncertainty of a freedom, were those that no points determine held.
+
+    What they would drag along changes no form, and is told by :func:`dragged`.
+    """
+    shares: Mapping[str, Mapping[str, float]] = part(form, "removed", "pose_uncertainty") or {}
+    refused = part(form, "removed", "not_determined") or ()
+    if not shares:
+        return None
+    return math.hypot(*(share[name] for source, share in shares.items() if source not in refused))
+
+
+def dragged(form: Mapping[str, Any], name: str) -> str:
+    """Return what moves with a freedom that the points do not determine, at the same form."""
+    shares: Mapping[str, float] = part(form, "removed", "pose_uncertainty", name) or {}
+    if not shares:
+        return ""
+    sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
+    own, *others = (
+        f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v
+    )
+    return f"; {own} would go with {', '.join(others)}, at the same form"
 
 
 def _size(value: Any, unit: str) -> str:

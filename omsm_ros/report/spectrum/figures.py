@@ -118,8 +118,13 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
     return made
 
 
-def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
-    """Every line of every scan at its frequency in time: what stays is no texture."""
+def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+    """Every line of every scan at its frequency in time: what stays is no texture.
+
+    None where there is no such line.
+    """
+    if not any(TIME in row.line.possible for _, named in scans for row in named):
+        return None
     made, axes = style.figure(_WIDTH_IN, 0.5 * len(scans) + 1.2)
     one = axes[0, 0]
     for level, (_, named) in enumerate(scans):

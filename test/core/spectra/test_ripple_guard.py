@@ -79,7 +79,7 @@ def test_the_accelerometer_tells_a_folded_vibration_in_one_scan(made):
     (rows,) = named((scan, accelerometer([(680.0, 4 * NM), (999.7, 5 * NM)])))
     assert kinds(rows) == {320.0: FOLDED, 0.3: FOLDED, 3.3: UNDECIDED}
     assert rows[320.0].frequency == pytest.approx(680.0, abs=1e-3)
-    assert "0.073" in rows[320.0].evidence[0]  # 4 nm · (2π 680 Hz)²
+    assert "73.0 mm/s²" in rows[320.0].evidence[0]  # 4 nm · (2π 680 Hz)²
 
 
 def test_a_far_too_weak_acceleration_explains_nothing(made):

@@ -20,12 +20,18 @@ FORM = {
     },
     "pose": {
         "piston": {"value": 1.5e-9, "uncertainty": 0.2e-9},
-        "tip": {"value": 50e-6, "uncertainty": 2e-6},
+        "tip": {"value": 50e-6, "uncertainty": 17e-3},
         "power": {"value": 0.25, "uncertainty": 0.01},
+        "clocking": {"value": 0.0, "uncertainty": 17.45e-3},
     },
     "removed": {
         "fitted": ["piston", "tip", "power"],
         "not_determined": {"clocking": "a sphere looks alike from all sides"},
+        "pose_uncertainty": {
+            "noise and form": {"piston": 0.12e-9, "tip": 2e-6, "power": 0.01},
+            "dynamics": {"piston": 0.16e-9, "tip": 0.0, "power": 0.0},
+            "clocking": {"piston": 0.0, "tip": 17e-3, "power": 0.0},
+        },
     },
 }
 
@@ -91,7 +97,10 @@ def test_what_was_taken_out_has_units_and_reasons():
     assert rows[0] == ("piston", "1.50 nm", "0.200 nm")
     assert rows[1] == ("tip", "50.0 µrad", "2.00 µrad")
     assert rows[2][1] == "0.250 1/m"
-    assert rows[3][:2] == ("not clocking", "a sphere looks alike from all sides")
+    assert rows[3][0] == "not clocking"
+    # What it would drag along is told here, and is not in the rows above.
+    assert rows[3][1].startswith("a sphere looks alike from all sides; clocking ± 17 mrad would")
+    assert "tip ± 17 mrad" in rows[3][1]
 
 
 def test_the_tightest_limit_comes_first():
