@@ -164,14 +164,16 @@ def _corrected(calibration: Calibration, made: Recording) -> tuple[SurfacePoints
     budget = scan_budget(
         calibration, sources, corrector.budget, Geometry(), stated(), trace, corrector.trace.seen
     )
-    return points, scan_fields(budget.fields, corrector.trace.every)
+    return points, scan_fields(budget.fields, corrector.trace.every, budget.bounds)
 
 
 def _form(
     x: np.ndarray, y: np.ndarray, height: np.ndarray, fields: ScanFields, fitted: Sequence[str]
 ) -> Form:
     portion = Portion(x, y, height, fields.at(0, len(x)))
-    return analyse_form(PAPER_MIRROR, lambda: [portion], fitted, sources=fields.names)
+    return analyse_form(
+        PAPER_MIRROR, lambda: [portion], fitted, sources=fields.names, bounds=fields.bounds
+    )
 
 
 def deviations(scans: Iterable[Scan]) -> dict[str, list[tuple[float, float]]]:

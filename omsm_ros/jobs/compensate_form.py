@@ -38,6 +38,7 @@ def compensate_form(
         measured.portions,
         asked,
         sources=measured.sources,
+        bounds=measured.bounds,
         aperture=aperture,
         even=measured.even,
     )

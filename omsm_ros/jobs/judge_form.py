@@ -42,6 +42,7 @@ def judge_form(
         measured.portions,
         asked,
         sources=measured.sources,
+        bounds=measured.bounds,
         aperture=aperture,
         even=measured.even,
         filters=filters,

@@ -81,7 +81,8 @@ class Judgement:
             done.trace.seen,
         )
         if self.out is not None and len(trace) and resolves_turns(trace):
-            save_fields(self.out / SYSTEMATIC, scan_fields(budget.fields, done.trace.every))
+            kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
+            save_fields(self.out / SYSTEMATIC, kept)
         return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
 
     def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:

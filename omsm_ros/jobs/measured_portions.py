@@ -28,6 +28,7 @@ class Measurement:
     systematic: whether the effects of systematic errors are known at all
     notes: what a reader of the results should know about how the file was understood
     even: whether the points are those of an evenly spaced grid
+    bounds: names of the sources of which only an upper bound is known
     """
 
     portions: Portions
@@ -35,6 +36,7 @@ class Measurement:
     systematic: bool
     notes: tuple[str, ...] = ()
     even: bool = False
+    bounds: tuple[str, ...] = ()
 
 
 def open_measurement(path: Path, units: LengthUnits | None = None) -> Measurement:
@@ -56,8 +58,9 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
         return Measurement(lambda: [whole], (), False, points.notes, as_grid(points) is not None)
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
-    names = fields.names if fields is not None else ()
-    return Measurement(lambda: _portions(cloud, fields), names, fields is not None)
+    if fields is None:
+        return Measurement(lambda: _portions(cloud, None), (), False)
+    return Measurement(lambda: _portions(cloud, fields), fields.names, True, bounds=fields.bounds)
 
 
 def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[Portion]:

@@ -25,6 +25,7 @@ def save_fields(path: Path | str, fields: ScanFields) -> None:
         names=np.array(fields.names, dtype=np.str_),
         fields=fields.fields.astype(np.float32),
         every=np.int64(fields.every),
+        bounds=np.array(fields.bounds, dtype=np.str_),
     )
     save_bytes(path, content.getvalue())
 
@@ -39,7 +40,11 @@ def load_fields(path: Path | str) -> ScanFields:
     try:
         with np.load(io.BytesIO(raw)) as content:  # no pickles, by default
             names, fields, every = (content[name] for name in _NAMES)
-        found = ScanFields(tuple(map(str, names)), fields.astype(np.float64), int(every))
+            # Where nobody says which are upper bounds, each may be one.
+            bounds = content["bounds"] if "bounds" in content else np.unique(names)
+        found = ScanFields(
+            tuple(map(str, names)), fields.astype(np.float64), int(every), tuple(map(str, bounds))
+        )
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
         raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err
     shape = found.fields.shape

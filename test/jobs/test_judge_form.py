@@ -162,6 +162,28 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
         assert told["deviation"][name]["uncertainty"] > plain["deviation"][name]["uncertainty"]
 
 
+def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path):
+    """It may be there or not: the figures say what was seen, and are that much less certain."""
+    cloud = CloudFile(folder / CLOUD).read()
+    u, v = (np.float64(cloud[name][::10]) / RADIUS for name in ("x", "y"))
+    fields = 80e-9 * (u**2 - v**2)[np.newaxis]
+    found = {}
+    for name, bounds in (("real", ()), ("bound", ("lateral_lag",))):
+        known = tmp_path / name
+        shutil.copytree(folder, known)
+        save_fields(known / SYSTEMATIC, ScanFields(("lateral_lag",), fields, 10, bounds))
+        words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
+        found[name] = json.loads(form(known, tmp_path / f"out_{name}", *words)[1].read_text())
+    rms, pv = (found["bound"]["deviation"][name] for name in ("rms", "peak_to_valley"))
+    assert rms["value"] == pytest.approx(np.hypot(ASTIGMATISM / 6**0.5, COMA / 8**0.5), rel=0.02)
+    true = np.ptp(Mirror.error.height(u * RADIUS, v * RADIUS))
+    assert pv["value"] == pytest.approx(true, rel=0.05)
+    assert found["real"]["deviation"]["rms"]["value"] < 0.5 * rms["value"]
+    for figure, size in ((rms, 80e-9 / np.sqrt(6)), (pv, 160e-9)):
+        assert 0.4 * size < figure["uncertainty"] < 1.5 * size
+    assert found["real"]["zernike"] == found["bound"]["zernike"]
+
+
 def test_the_deviations_are_left_for_other_programs(folder, tmp_path):
     """As a map over the part, which our own reader takes like any other."""
     _, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)

@@ -9,7 +9,7 @@ from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.errors import FileError
 from omsm_ros.storage.fields_file import load_fields, save_fields
 
-FIELDS = ScanFields(("tilt", "tilt"), np.arange(6.0).reshape(2, 3) * 1e-9, 32)
+FIELDS = ScanFields(("tilt", "tilt"), np.arange(6.0).reshape(2, 3) * 1e-9, 32, ("tilt",))
 
 
 def test_there_and_back(tmp_path):
@@ -17,10 +17,17 @@ def test_there_and_back(tmp_path):
     save_fields(path, FIELDS)
     found = load_fields(path)
     assert (found.names, found.every) == (FIELDS.names, 32)
+    assert found.bounds == ("tilt",)
     assert np.allclose(found.fields, FIELDS.fields, rtol=1e-6, atol=0)
     none = ScanFields((), np.empty((0, 0)), 1)
     save_fields(path, none)
     assert load_fields(path).names == ()
+
+
+def test_where_nobody_says_which_are_upper_bounds_each_may_be_one(tmp_path):
+    path = tmp_path / "systematic.npz"
+    np.savez(path, names=np.array(["tilt", "tilt", "pitch"]), fields=np.zeros((3, 4)), every=1)
+    assert load_fields(path).bounds == ("pitch", "tilt")
 
 
 @pytest.mark.parametrize(

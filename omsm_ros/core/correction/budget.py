@@ -16,6 +16,7 @@ from omsm_ros.core.correction.machine_sources import (
     RANDOM,
     MachineSources,
     origin_of,
+    upper_bounds,
     whole_scan_sources,
 )
 from omsm_ros.core.correction.source_kinds import KINDS
@@ -76,6 +77,7 @@ class ScanBudget:
     fields: by source, change of the heights of ``points`` per standard uncertainty [m], (k, n)
     random: standard uncertainty of one height from what is independent [m]
     seen: points of the whole scan
+    bounds: names of the sources of which only an upper bound is known
     """
 
     rows: tuple[BudgetRow, ...]
@@ -83,6 +85,7 @@ class ScanBudget:
     fields: Mapping[str, FloatArray]
     random: float
     seen: int
+    bounds: tuple[str, ...]
 
     @property
     def systematic(self) -> float:
@@ -129,7 +132,14 @@ def scan_budget(
         *_systematic_rows(acting, fields),
     ]
     noise = float(np.sqrt(sum(random.get(name, 0.0) ** 2 for name in RANDOM)))
-    return ScanBudget(rows=tuple(rows), points=trace, fields=fields, random=noise, seen=seen)
+    return ScanBudget(
+        rows=tuple(rows),
+        points=trace,
+        fields=fields,
+        random=noise,
+        seen=seen,
+        bounds=upper_bounds(calibration, stated),
+    )
 
 
 def _random_rows(

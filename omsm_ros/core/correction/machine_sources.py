@@ -149,6 +149,16 @@ def whole_scan_sources(
     return (*found, *stated.of_the_scan())
 
 
+def upper_bounds(calibration: Calibration, stated: MachineSources) -> tuple[str, ...]:
+    """Return the names of the sources of which it is known how large they are at most.
+
+    A step test that does not show a term says how large it could be; where nothing divides the
+    lag, any part of it could be latency. Neither need be there at all.
+    """
+    open_lag = not latency_of(calibration).resolved and not stated.of("lateral_lag")
+    return ("could_hide", "lateral_lag") if open_lag else ("could_hide",)
+
+
 def origin_of(name: str, calibration: Calibration, stated: MachineSources) -> tuple[str, str]:
     """Return whether a source of single points was evaluated or declared, and why."""
     if said := stated.of(name):

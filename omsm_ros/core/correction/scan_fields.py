@@ -7,7 +7,7 @@ propagated through a few fields, not through hundreds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +28,13 @@ class ScanFields:
 
     names: of the source of each, (s,);  every: of how many points of the scan one is here
     fields: change of the heights [m] per standard uncertainty, (s, m)
+    bounds: names of the sources of which only an upper bound is known
     """
 
     names: tuple[str, ...]
     fields: FloatArray
     every: int
+    bounds: tuple[str, ...] = ()
 
     def at(self, first: int, count: int) -> FloatArray:
         """Return the fields (s, count) [m] at the scan's points from ``first`` on."""
@@ -48,8 +50,13 @@ class ScanFields:
         )
 
 
-def scan_fields(fields: Mapping[str, FloatArray], every: int) -> ScanFields:
-    """Return the components that count of ``fields``, by source (k, m) [m]."""
+def scan_fields(
+    fields: Mapping[str, FloatArray], every: int, bounds: Collection[str] = ()
+) -> ScanFields:
+    """Return the components that count of ``fields``, by source (k, m) [m].
+
+    bounds: names of the sources of which only an upper bound is known
+    """
     names: list[str] = []
     rows: list[FloatArray] = []
     for name, found in fields.items():
@@ -59,7 +66,9 @@ def scan_fields(fields: Mapping[str, FloatArray], every: int) -> ScanFields:
     if not rows:
         return ScanFields((), np.empty((0, 0)), every)
     kept = np.flatnonzero(_count(np.array(rows), _LEFT_OUT_OF_ALL))
-    return ScanFields(tuple(names[k] for k in kept), np.array([rows[k] for k in kept]), every)
+    left = tuple(names[k] for k in kept)
+    known = tuple(name for name in bounds if name in left)
+    return ScanFields(left, np.array([rows[k] for k in kept]), every, known)
 
 
 def resolves_turns(points: ScanPoints) -> bool:

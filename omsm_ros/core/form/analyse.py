@@ -72,6 +72,7 @@ def analyse_form(
     asked: Sequence[str],
     *,
     sources: Sequence[str] = (),
+    bounds: Sequence[str] = (),
     aperture: Aperture | None = None,
     even: bool = False,
     filters: tuple[float | None, float | None] = (None, None),
@@ -80,6 +81,7 @@ def analyse_form(
 
     portions: reads the points, see :class:`omsm_ros.core.surface.placement.Portion`
     asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
+    bounds: of these, the ones of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points
     even: the points are those of an evenly spaced grid, each of the same area
     filters: wavelengths of the S- and the L-filter [m], None for what the points allow
@@ -91,7 +93,7 @@ def analyse_form(
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
-    map_ = gathered.map(found, even)
+    map_ = gathered.map(found, even, [n for n, name in enumerate(sources) if name in bounds])
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
     cells = Cells.of(map_)
@@ -190,8 +192,11 @@ class _Gathered:
         """Largest minus smallest deviation of all points [m]."""
         return float(self._most - self._least)
 
-    def map(self, found: Registration, even: bool) -> DeviationMap:
-        """Return the deviations gathered. Raises DataError if there are none."""
+    def map(self, found: Registration, even: bool, bounds: Sequence[int]) -> DeviationMap:
+        """Return the deviations gathered. Raises DataError if there are none.
+
+        bounds: places of the sources of which only an upper bound is known
+        """
         if not self.counts["used"]:
             raise DataError(f"no point can be used: {self.counts!r}; check aperture and surface")
         rows = np.ascontiguousarray(self._kept.rows().T)
@@ -203,4 +208,6 @@ class _Gathered:
             effects=rows[3:],
             # Points need not come in the order of a path; then their neighbours are elsewhere.
             noise=min(float(np.median(self._noise)), noise_beside(*rows[:3]), found.noise),
+            # The sources' effects stand behind those of the pose.
+            bounds=len(rows) - 3 - self._sources + np.array(bounds, np.int64),
         )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +29,7 @@ class DeviationMap:
     area: which each point stands for, of mean one (n,)
     effects: what each independent source of error, off by its standard uncertainty, does to the
         deviations (e, n) [m]
+    bounds: which of the effects are upper bounds of errors that may not be there at all
     noise: standard deviation of one point [m]
     """
 
@@ -38,6 +39,7 @@ class DeviationMap:
     area: FloatArray
     effects: FloatArray
     noise: float
+    bounds: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -49,6 +51,7 @@ class DeviationMap:
             **{name: getattr(self, name)[chosen] for name in ("x", "y", "deviation", "area")},
             effects=self.effects[:, chosen],
             noise=self.noise,
+            bounds=self.bounds,
         )
 
 

@@ -10,6 +10,10 @@ all there is. So with F of the deviations and F' of the deviations with errors d
 (simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Noise from
 point to point is first averaged out by smooth terms; of what they leave, the share that is no noise
 stays.
+
+An upper bound is no error that is there: how large an open latency is, nobody knows. It is not
+subtracted. By how much an error of its size would change the square, as mean square about none, is
+uncertainty of the figure.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap, Figure, weighted_quantiles
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
@@ -45,9 +49,16 @@ def rms_of_part(map_: DeviationMap) -> Figure:
     products = weighted @ map_.effects.T
     shared = weighted @ map_.deviation
     noise = map_.noise**2
-    square = float(share @ map_.deviation**2 - np.trace(products) - noise)
-    of_form = 4 * max(float(shared @ shared) - float(np.sum(products**2)), 0.0)
-    variance = of_form + 2 * float(np.sum(products**2)) + _variance_by_noise(map_, share)
+    real = _real(map_)
+    among_real = products[np.ix_(real, real)]
+    square = float(share @ map_.deviation**2 - np.trace(among_real) - noise)
+    of_form = 4 * max(float(np.sum(shared[real] ** 2)) - float(np.sum(among_real**2)), 0.0)
+    # With e = Σ a_i f_i that may be there, 2 d·e − e·e has the mean square 4 Σ (d·f_i)² + tr² P +
+    # 2 tr P², P the products of the f_i.
+    bounded = float(np.trace(products) - np.trace(among_real))
+    of_bounds = 4 * float(np.sum(shared[~real] ** 2)) + bounded**2
+    of_errors = of_form + of_bounds + 2 * float(np.sum(products**2))
+    variance = of_errors + _variance_by_noise(map_, share)
     return _of_square(square, float(np.sqrt(variance)))
 
 
@@ -59,7 +70,7 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     few = map_.every(_MOST_FITTED)
     fit = _smooth(few, disc)
     base = _without_noise(few, fit)
-    drawn, chosen = _drawn(few, fit, base)
+    drawn, bounded, chosen = _drawn(few, fit, base)
     area = few.area[chosen]
 
     def robust(deviations: FloatArray, area: FloatArray) -> FloatArray:
@@ -73,9 +84,9 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     for extent in (whole, robust):
         of_all = float(extent(base[:, np.newaxis], few.area)[0])
         of_some = float(extent(base[chosen][:, np.newaxis], area)[0])
-        again = extent(drawn, area)
-        square = 2 * of_some**2 - float(np.mean(again**2))
-        figure = _of_square(square, float(np.std(again**2)))
+        again, more = extent(drawn, area) ** 2, extent(bounded, area) ** 2
+        square = 2 * of_some**2 - float(np.mean(again))
+        figure = _of_square(square, float(np.hypot(np.std(again), _rms(more - again))))
         found.append(Figure((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
 
@@ -97,16 +108,34 @@ def _without_noise(map_: DeviationMap, fit: ZernikeFit) -> FloatArray:
     return np.asarray(smooth + share * rest, np.float64)
 
 
-def _drawn(map_: DeviationMap, fit: ZernikeFit, base: FloatArray) -> tuple[FloatArray, slice]:
-    """Return some of the deviations with errors drawn anew (m, draws), and which they are."""
+def _drawn(
+    map_: DeviationMap, fit: ZernikeFit, base: FloatArray
+) -> tuple[FloatArray, FloatArray, slice]:
+    """Return some of the deviations with errors drawn anew (m, draws), and which they are.
+
+    The second has also what may be there of the upper bounds.
+    """
     chosen = slice(None, None, -(-len(map_) // _MOST_DRAWN))
     random = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(fit.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     terms = zernike_values(*fit.disc.scaled(map_.x[chosen], map_.y[chosen]), fit.terms)
-    ways = np.concatenate([map_.effects[:, chosen], root.T @ terms])
-    errors = ways.T @ random.normal(size=(len(ways), _DRAWS))
-    return base[chosen][:, np.newaxis] + errors, chosen
+    real, effects = _real(map_), map_.effects[:, chosen]
+    ways = np.concatenate([effects[real], root.T @ terms])
+    drawn = base[chosen][:, np.newaxis] + ways.T @ random.normal(size=(len(ways), _DRAWS))
+    bounds = effects[~real]
+    return drawn, drawn + bounds.T @ random.normal(size=(len(bounds), _DRAWS)), chosen
+
+
+def _real(map_: DeviationMap) -> BoolArray:
+    """Return which effects (e,) are of errors that are there, whatever their sign."""
+    real = np.ones(len(map_.effects), np.bool_)
+    real[map_.bounds] = False
+    return real
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:

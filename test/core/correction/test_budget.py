@@ -21,6 +21,7 @@ from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, NOT_EVALUATED
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.latency import declared, with_latency
 from omsm_ros.core.machine.kinematics import Geometry, WorkpiecePoints
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
@@ -103,6 +104,17 @@ def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
     found = scan_budget(known, NO_ERRORS, {}, Geometry(), NOTHING_STATED, trace, len(trace))
     assert found.heights == pytest.approx({"could_hide": 1e-6 * np.std(trace.y)})
     assert "dynamics" in found.not_evaluated
+
+
+def test_an_open_lag_is_an_upper_bound_and_one_that_was_measured_is_not(
+    true_calibration: Calibration,
+) -> None:
+    assert budget(true_calibration).bounds == ("could_hide", "lateral_lag")
+    said = MachineSources((stated("lateral_lag", 1e-6),))
+    assert budget(true_calibration, said).bounds == ("could_hide",)
+    lag = true_calibration.dynamics.low_frequency_delay
+    known = with_latency(true_calibration, declared(lag, 0.0, 1e-6, "light switch"))
+    assert budget(known).bounds == ("could_hide",)
 
 
 def test_several_statements_of_one_source_are_one_row(true_calibration: Calibration) -> None:

@@ -30,11 +30,12 @@ EFFECTS = np.array(
 )
 
 
-def map_of(deviation, noise=0.0, effects=None, area=None):
+def map_of(deviation, noise=0.0, effects=None, area=None, bounds=()):
     n = len(deviation)
     return DeviationMap(
         x=X[:n], y=Y[:n], deviation=deviation, area=np.ones(n) if area is None else area,
         effects=np.empty((0, n)) if effects is None else effects, noise=noise,
+        bounds=np.array(bounds, np.int64),
     )  # fmt: skip
 
 
@@ -87,6 +88,46 @@ def test_two_uncertainties_hold_the_truth_of_any_part_nineteen_times_in_twenty(s
         assert held[name] >= 20, name
         # Taken as they are, a perfect part's would be 60 nm and 15 nm.
         assert abs(error[name]) < {"pv": 30e-9, "robust": 30e-9, "rms": 8e-9}[name]
+
+
+@pytest.mark.parametrize("there", [0.0, 0.3, 1.0, -1.0])
+def test_an_upper_bound_widens_but_is_not_subtracted(there):
+    """An open latency may do 60 nm; the figures are of what was seen, whatever of it is there."""
+    bound = 30e-9 * X / 1e-2 * (1 - 0.5 * (_RADIUS / 1e-2) ** 2)
+    effects = np.concatenate([EFFECTS / 20, bound[np.newaxis]])
+    deviation = FORM + there * bound
+    seen = figures(map_of(deviation))
+    known = figures(map_of(deviation, effects=EFFECTS / 20))
+    told = figures(map_of(deviation, effects=effects, bounds=[len(EFFECTS)]))
+    for name, figure in told.items():
+        assert figure.value == pytest.approx(seen[name].value, rel=0.05), name
+        assert figure.value == pytest.approx(known[name].value, rel=0.02), name
+        assert abs(figure.value - TRUE[name]) <= 2 * figure.uncertainty, name
+        assert figure.uncertainty > 2 * known[name].uncertainty, name
+
+
+def test_a_bound_beyond_the_map_leaves_the_figure_open():
+    """Nothing but noise was seen; of 200 nm that could be there anything may be."""
+    bound = 100e-9 * X / 1e-2
+    rng = np.random.default_rng(4)
+    told = map_of(rng.normal(0.0, 1e-9, POINTS), 1e-9, bound[np.newaxis], bounds=[0])
+    for figure in figures(told).values():
+        assert figure.value < 3e-9
+        assert figure.uncertainty > 0.5 * np.sqrt(np.mean(bound**2))
+
+
+def test_the_rms_under_a_bound_is_that_of_draws():
+    """Closed form against errors drawn from the bound, about the value that is stated."""
+    rng = np.random.default_rng(8)
+    bounds = EFFECTS[:2]
+    told = rms_of_part(map_of(FORM, effects=bounds, bounds=[0, 1]))
+    drawn = FORM - rng.normal(size=(4000, 2)) @ bounds
+    spread = np.sqrt(np.mean((np.mean(drawn**2, axis=1) - np.mean(FORM**2)) ** 2))
+    assert told.value == pytest.approx(np.sqrt(np.mean(FORM**2)), rel=1e-9)
+    low = np.sqrt(max(told.value**2 - 2 * spread, 0.0))
+    high = np.sqrt(told.value**2 + 2 * spread)
+    expected = max(told.value - low, high - told.value) / 2
+    assert told.uncertainty == pytest.approx(expected, rel=0.05)
 
 
 def test_the_rms_is_by_area():
