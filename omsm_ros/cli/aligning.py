@@ -15,6 +15,9 @@ from omsm_ros.readable import measured, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.machine_files import save_geometry
 
+# Beyond it nine tenths of the mean square are something else than noise.
+_NOT_NOISE = 3.0
+
 # --------------------------------------------------------------------------------- align
 
 
@@ -41,6 +44,7 @@ def _align(args: argparse.Namespace) -> Facts:
         "geometry": asdict(found.geometry),
         "uncertainty": dict(zip(names, spread, strict=True)),
         "residual": found.residual,
+        "scatter": found.scatter,
         "beam_found": found.beam_found,
         "used": found.used,
         "samples": account.as_dict(),
@@ -56,7 +60,16 @@ def _show_align(facts: Facts) -> None:
         rows.append(
             (name, stated if spread is not None else f"{stated}, not identifiable in this scan")
         )
-    rows.append(("residual", f"{quantity(facts['residual'], 'm')} rms"))
+    residual, scatter = (quantity(facts[name], "m") for name in ("residual", "scatter"))
+    rows.append(("residual", f"{residual} rms, of which noise {scatter}"))
+    if facts["residual"] > _NOT_NOISE * facts["scatter"]:
+        rows.append(
+            (
+                "warning",
+                "most of the residual is no noise: this is no sphere of that radius, or its form "
+                "or the probe's error on slopes is as large; the centre may be worse than stated",
+            )
+        )
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
     table([*rows, ("written to", facts["file"])])

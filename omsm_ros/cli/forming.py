@@ -145,7 +145,7 @@ def _show_surface(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "form",
-        "register a cloud to its nominal surface and judge its form",
+        "the part's pose and its form: deviation, Zernike terms, texture",
         _declare_form,
         _form,
         _show_form,

@@ -246,7 +246,14 @@ def _show_validate(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("identify", "identify G_m from a recording", _declare, _identify, _show, rejected),
+    Command(
+        "identify",
+        "the transfer function from encoder to probe, from a step test",
+        _declare,
+        _identify,
+        _show,
+        rejected,
+    ),
     Command(
         "validate",
         "run a model over another record: how much of it does it account for?",

@@ -8,7 +8,8 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from omsm_ros import __version__, quantities
@@ -20,6 +21,7 @@ from omsm_ros.storage import strict_json
 DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
 
 _LONGEST_LINE = 1500
+_WIDTH, _INDENT = 79, 14
 
 # A correction takes a quarter of a second; loading what identifies would take twice that.
 WORDS = {
@@ -39,6 +41,21 @@ WORDS = {
     "omsm_ros.cli.rippling": ("spectrum",),
 }
 
+DEMO = "demo"
+_DEMO_HELP = "calibrate and measure on the digital twin (needs ROS)"
+
+# As one comes to need them, for the list of all commands.
+TASKS = {
+    "begin": ("doctor", DEMO, "twin"),
+    "recordings": ("inspect", "import"),
+    "dynamics of probe and machine": ("plan", "identify", "verify", "compare", "calset"),
+    "latency": ("selfcal", "reversal", "latency"),
+    "a scan": ("surface", "predict", "align", "correct"),
+    "the part": ("form", "compensate", "difference", "spectrum", "export"),
+    "many scans": ("batch", "history"),
+    "models of other systems": ("validate",),
+}
+
 # What stands after "--" is for the command that these run in turn.
 PASS_ON = ("batch",)
 
@@ -54,6 +71,7 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
   identify the dynamics         omsm identify steps.mcap --out cal.json --report certificate/
   how fast may a scan be?       omsm predict scan.csv --calibration cal.json
   correct a scan                omsm correct scan.mcap --calibration cal.json --out result/
+  what shape is the part?       omsm form result/ --nominal mirror.yaml --out form/
 
 'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
 
@@ -64,20 +82,38 @@ def _commands(word: str) -> list[Command]:
     return [c for module in wanted for c in importlib.import_module(module).COMMANDS]
 
 
+def _by_task(helps: Mapping[str, str]) -> str:
+    """The commands with what each does, those of one task together."""
+    lines, placed = [], {word for words in TASKS.values() for word in words}
+    others = tuple(word for word in helps if word not in placed)
+    for task, words in {**TASKS, "others": others}.items():
+        lines += ["", f"{task}:"] if words else []
+        for word in words:
+            told = helps.get(word, "")
+            lines += textwrap.wrap(
+                f"  {word:<{_INDENT - 2}}{told}", _WIDTH, subsequent_indent=" " * _INDENT
+            )
+    return "\n".join([*lines, "", "'omsm COMMAND --help' has the options of each."])
+
+
 def parser_of(word: str) -> argparse.ArgumentParser:
     """Return the parser of ``omsm``: with the command ``word``, or with all of them."""
     parser = OneLineParser(
-        prog="omsm", description="Identify, correct and judge recorded measurements."
+        prog="omsm",
+        description="Identify, correct and judge recorded measurements.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.word = word if any(word in words for words in WORDS.values()) else ""
     parser.add_argument("--version", action="version", version=__version__)
     words = parser.add_subparsers(required=True, metavar="command", dest="command")
-    for command in _commands(word):
-        sub = words.add_parser(command.name, help=command.help, description=command.help)
+    commands = _commands(word)
+    parser.epilog = _by_task({DEMO: _DEMO_HELP, **{c.name: c.help for c in commands}})
+    for command in commands:
+        sub = words.add_parser(command.name, description=command.help)
         sub.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
         sub.set_defaults(run=command)
         command.declare(sub)
-    demo = words.add_parser("demo", help="calibrate and measure on the digital twin (needs ROS)")
+    demo = words.add_parser(DEMO, description=_DEMO_HELP)
     demo.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
@@ -159,7 +195,7 @@ def _split(given: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    if args.command == "demo":
+    if args.command == DEMO:
         return _demo(args)
     facts = args.run.act(args)
     if args.json:

@@ -240,5 +240,11 @@ COMMANDS = (
         _predict,
         _show_predict,
     ),
-    Command("correct", "correct a recorded scan", _declare_correct, _correct, _show_correct),
+    Command(
+        "correct",
+        "correct a recorded scan: cloud, summary and report",
+        _declare_correct,
+        _correct,
+        _show_correct,
+    ),
 )

@@ -191,6 +191,19 @@ def test_the_help_of_the_command_is_named_where_its_arguments_are_wrong(capsys):
     assert "see 'omsm history --help'" in capsys.readouterr().err
 
 
+def test_the_list_of_commands_has_each_once_with_its_task(capsys):
+    from omsm_ros.cli.main import DEMO, TASKS, WORDS
+
+    of_tasks = [word for words in TASKS.values() for word in words]
+    assert sorted(of_tasks) == sorted([DEMO, *(w for words in WORDS.values() for w in words)])
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    said = capsys.readouterr().out
+    for word in of_tasks:
+        (line,) = (one for one in said.splitlines() if one.startswith(f"  {word} "))
+        assert len(line.split()) > 2, "what it does"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

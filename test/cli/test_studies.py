@@ -1,6 +1,7 @@
 """Commands that judge rather than correct: plan, verify, compare, predict, reversal, align."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -85,6 +86,19 @@ def test_align_finds_the_spindle(capsys, tmp_path, calibration):
     # Across the feed, a sphere that runs true shows an offset in second order only.
     assert found["uncertainty"]["centre_y"] > 10e-6
     assert machine_files.load_geometry(out).centre_x == found["geometry"]["centre_x"]
+
+
+@pytest.mark.parametrize("wrong", [0.0, -0.01])
+def test_align_warns_where_the_sphere_is_another(capsys, tmp_path, calibration, wrong):
+    """A radius that is 1 % off leaves far more than the 10 nm by which the points scatter."""
+    part = Sphere(SPHERE_RADIUS_M)
+    bag = write(tmp_path / "s.mcap", record(Cell(), Spiral(part, 4e-3, 8e-4, 30.0), part))
+    words = ("align", bag, "--calibration", calibration, "--radius", SPHERE_RADIUS_M * (1 + wrong))
+    assert cli.main([str(word) for word in (*words, "--out", tmp_path / "geometry.yaml")]) == 0
+    said = capsys.readouterr().out
+    assert ("warning" in said) is bool(wrong)
+    noise = float(re.search(r"of which noise ([\d.]+) nm", said)[1])
+    assert noise == pytest.approx(10.5, rel=0.15)
 
 
 @pytest.mark.parametrize(

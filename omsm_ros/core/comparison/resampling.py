@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from omsm_ros.core.comparison.cells import Trend, averaged, cell_side, portions
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.samples.scatter import spread
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
@@ -38,8 +39,6 @@ _LARGEST_GAIN = 1.0
 # The value of a quadratic whose columns are nearly dependent is a guess.
 _WORST_CONDITION = 1e-6
 _WIDER, _PROBED = 1.5, 3_000
-# Standard deviation of a normal distribution over the median of its magnitudes.
-_SIGMA_OF_MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +82,7 @@ class LocalQuadratic:
         some = slice(None, None, max(len(points) // _PROBED, 1))
         near = self.at(points.x[some], points.y[some])
         residual = (points.height[some] - near.value)[np.isfinite(near.value)]
-        self._scatter = _SIGMA_OF_MAD * float(np.median(np.abs(residual))) if len(residual) else 0.0
+        self._scatter = spread(residual) if len(residual) else 0.0
 
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
         """Heights, slopes and their uncertainties at x, y [m], each (m,)."""

@@ -12,7 +12,6 @@ from omsm_ros.core.form.figures import (
     DeviationMap,
     Figure,
     noise_beside,
-    noise_of,
     root_mean_square,
 )
 from omsm_ros.core.form.optical_terms import optical_terms
@@ -25,6 +24,7 @@ from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.scatter import noise_of
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.placement import (
     Aperture,

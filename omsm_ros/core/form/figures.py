@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.samples.scatter import noise_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,17 +69,6 @@ def weighted_quantiles(
     below = np.cumsum(weights[order]) - weights[order] / 2
     found = np.interp(np.array(shares) * weights.sum(), below, values[order])
     return tuple(float(value) for value in found)
-
-
-def noise_of(deviation: FloatArray) -> float:
-    """Return the standard deviation of what changes from point to point [m], robustly.
-
-    From second differences of points in the order in which they were measured, for which form and
-    slow drift are straight lines: ``median |d_(i−1) − 2 d_i + d_(i+1)| = 0.6745 √6 σ``.
-    """
-    if len(deviation) < 3:
-        return 0.0
-    return float(np.median(np.abs(np.diff(deviation, 2))) * 1.4826 / np.sqrt(6))
 
 
 def noise_beside(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:

@@ -19,8 +19,10 @@ from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.scatter import noise_of
 from omsm_ros.errors import DataError
 from omsm_ros.least_squares import least_squares, unit_columns
+from omsm_ros.readable import quantity
 from omsm_ros.units import MICROMETRE_M
 
 _COLUMNS = ("x", "y", "z", "b", "c", "distance")
@@ -57,7 +59,8 @@ class Alignment:
 
     uncertainty: standard uncertainties of centre_x, centre_y [m], beam_x, beam_y [1]
     sphere: centre in the workpiece frame and radius [m]; convex if its centre lies below
-    residual: rms left [m];  beam_found: False where the distance hardly varied
+    residual: rms left [m];  scatter: of a point about its neighbours [m], what noise alone leaves
+    beam_found: False where the distance hardly varied
     used: points fitted
     """
 
@@ -65,6 +68,7 @@ class Alignment:
     uncertainty: tuple[float, float, float, float]
     sphere: tuple[float, float, float, float]
     residual: float
+    scatter: float
     beam_found: bool
     used: int
 
@@ -144,7 +148,8 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     residual = float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
     if not found.success or residual > 0.01 * abs(radius):
         raise DataError(
-            f"the scan does not fit a sphere of radius {radius!r} m: {residual!r} m are left; "
+            f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: "
+            f"{quantity(residual, 'm')} rms are left; "
             "check the radius and its sign, and that the scan covers the sphere"
         )
     deviations = _standard_uncertainties(found.jac, found.fun)
@@ -157,6 +162,7 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
         uncertainty=(float(in_si[0]), float(in_si[1]), float(lean[0]), float(lean[1])),
         sphere=(sphere[0], sphere[1], sphere[2], radius),
         residual=residual,
+        scatter=noise_of(found.fun) * MICROMETRE_M,
         beam_found=beam,
         used=len(scan.z),
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
@@ -41,7 +42,6 @@ _ENOUGH_FOR_A_CURVE = 2000
 _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 # Of one in a million points of Gaussian noise; texture has shorter tails.
 OUTLIER_SIGMAS = 5.0
-_SIGMA_OF_MAD = 1.4826
 _MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
 _LEAST_LIMIT_M = 1e-12
 
@@ -160,11 +160,6 @@ def _about_the_origin(points: Placed) -> Aperture:
     return Aperture(float(np.hypot(points.x - x, points.y - y).max()) or 1.0, x, y)
 
 
-def _spread(values: FloatArray) -> float:
-    """Return the standard deviation of Gaussian values (n,) about zero, whatever a few do."""
-    return _SIGMA_OF_MAD * float(np.median(np.abs(values)))
-
-
 def _limit_of(residual: FloatArray, spread: float) -> float:
     """Return the distance [m] from the smooth form beyond which a point is dust.
 
@@ -187,7 +182,7 @@ def _coarse(
         if turn:
             middle = points.deviation - np.median(points.deviation)
             # Generous: what is left here is still the pose.
-            points = points.part(np.abs(middle) <= max(8 * _spread(middle), _LEAST_LIMIT_M))
+            points = points.part(np.abs(middle) <= max(8 * scatter.spread(middle), _LEAST_LIMIT_M))
         if len(points.x) < _LEAST_POINTS:
             break
         columns = -freedom_columns(at, points, names)
@@ -195,7 +190,7 @@ def _coarse(
         step = np.linalg.lstsq((columns / scale[:, np.newaxis]).T, points.deviation, rcond=1e-12)
         at = at.moved(names, step[0] / scale)
         # The refinement that follows converges from far more.
-        settled = max(_SHARE_OF_SPREAD * _spread(points.deviation), _SETTLED_M)
+        settled = max(_SHARE_OF_SPREAD * scatter.spread(points.deviation), _SETTLED_M)
         if turn > 1 and float(np.max(np.abs(step[0]))) < settled:
             return at
     raise DataError(
@@ -283,11 +278,11 @@ class _Fit:
             sums = self.new_sums(0)
             residual = self.sums(at, chosen, form, limit, sums)
             if turn == 0:
-                limit = max(2 * OUTLIER_SIGMAS * _spread(residual), _LEAST_LIMIT_M)
+                limit = max(2 * OUTLIER_SIGMAS * scatter.spread(residual), _LEAST_LIMIT_M)
                 continue
             found, _ = self.solved(sums)
             at, form = at.moved(self.names, found.step), found.form
-            spread = _spread(residual - np.median(residual))
+            spread = scatter.spread(residual - np.median(residual))
             limit = _limit_of(residual, spread)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             if turn > 3 and float(np.max(np.abs(found.step) * own)) < _SHARE_OF_SPREAD * spread:

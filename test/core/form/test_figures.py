@@ -6,11 +6,11 @@ import pytest
 from omsm_ros.core.form.figures import (
     DeviationMap,
     noise_beside,
-    noise_of,
     root_mean_square,
     weighted_quantiles,
 )
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
+from omsm_ros.core.samples.scatter import noise_of
 from omsm_ros.core.surface.placement import Aperture
 
 DISC = Aperture(1e-2)
