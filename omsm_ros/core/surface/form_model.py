@@ -11,7 +11,8 @@ J the freedoms of the fit, without bounds, and Z polynomials of orders 2 to 8, w
 (D. MacKay, Neural Comput. 4, 415; the fixed point of its eq. 4.9). Form falls with order: no order
 may have less than a higher one, and a size found from few terms may be that of a lucky part: it is
 taken as large as six of seven parts would have it. So a shift is read off those orders in which
-this part is good, and its uncertainty holds what the others may have.
+this part is good, and its uncertainty holds what the others may have. Dust is what lies far from
+any sum of the columns.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
@@ -50,6 +52,13 @@ _MOST_SHARE = 100.0
 # Of the normal distribution at 15 %. With it 95 % bands held the truth in 93 to 100 % of simulated
 # parts with spectra from n⁻² to n⁻⁶, or with single terms; with 20 %, in 90 to 100 %.
 _QUANTILE = 1.0364
+# Of one in a million points of Gaussian noise; texture has shorter tails.
+OUTLIER_SIGMAS = 5.0
+_MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
+LEAST_LIMIT_M = 1e-12
+# The first fit has dust in it, the second hardly any.
+_DUST_PASSES = 3
+_LEAST_RELAXED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,3 +197,45 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
             value = above = max(value, above)
         new[chosen] = value
     return new
+
+
+def limit_of(residual: FloatArray) -> float:
+    """Return the distance [m] from the smooth form beyond which a point is dust.
+
+    Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
+    """
+    common = float(np.quantile(np.abs(residual), 1 - _MOST_DUST))
+    return max(OUTLIER_SIGMAS * scatter.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
+
+
+def most_like(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:
+    """Return the sum (q,) of ``columns`` (q, n) that is most like, and how far from it is dust [m].
+
+    Without bounds on any column: what the pose leaves after a step that was not small, or a form
+    that is not known yet, is neither noise nor dust.
+    """
+    scale = np.sqrt(np.mean(columns**2, axis=1))
+    scale[scale == 0] = 1.0
+    columns = columns / scale[:, np.newaxis]
+    limit, residual, fitted = np.inf, deviation, np.zeros(len(columns))
+    for _ in range(_DUST_PASSES):
+        chosen = np.abs(residual) <= limit
+        near = columns[:, chosen]
+        solve = np.linalg.pinv(near @ near.T, rcond=1e-12, hermitian=True)
+        fitted = np.asarray(solve @ (near @ deviation[chosen]), np.float64)
+        residual = deviation - fitted @ columns
+        limit = limit_of(residual)
+    return fitted / scale, limit
+
+
+def relaxed(share: float, last: FloatArray, step: FloatArray) -> float:
+    """Return the share of a ``step`` (p,) to take, after ``share`` of the one before it.
+
+    Where form and pose look alike, a whole step overshoots: what form there may be follows the
+    pose (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275).
+    """
+    change = last - step
+    square = float(change @ change)
+    if not np.any(last) or square == 0:
+        return 1.0
+    return float(np.clip(share * float(last @ change) / square, _LEAST_RELAXED, 1.0))

@@ -18,7 +18,15 @@ from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.form_model import Estimate, FormBasis, estimate
+from omsm_ros.core.surface.form_model import (
+    LEAST_LIMIT_M,
+    Estimate,
+    FormBasis,
+    estimate,
+    limit_of,
+    most_like,
+    relaxed,
+)
 from omsm_ros.core.surface.freedoms import Freedoms, determined, widest
 from omsm_ros.core.surface.normal_equations import NormalEquations
 from omsm_ros.core.surface.placement import (
@@ -36,14 +44,10 @@ from omsm_ros.errors import DataError
 
 CHUNK = 16_384
 _MOST_SELECTED, _LEAST_POINTS = 40_000, 200
-_MOST_TURNS = 30
+_MOST_TURNS, _MOST_REFINED = 30, 30
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose stands when its last step moved no point by more than this share of their spread.
 _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
-# Of one in a million points of Gaussian noise; texture has shorter tails.
-OUTLIER_SIGMAS = 5.0
-_MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
-_LEAST_LIMIT_M = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,9 +128,9 @@ def register(
     disc = aperture or _about_the_origin(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
     fit = _Fit(surface, freedoms, aperture, basis)
-    at, found, limit = fit.refine(at, chosen)
+    at, like, limit = fit.refine(at, chosen)
     unknown = fit.unknown(at, chosen)
-    return _over_all(fit, at, found, limit, portions, sources, unknown)
+    return _over_all(fit, at, like, limit, portions, sources, unknown)
 
 
 def _selection(portions: Portions) -> Portion:
@@ -160,15 +164,6 @@ def _about_the_origin(points: Placed) -> Aperture:
     return Aperture(float(np.hypot(points.x - x, points.y - y).max()) or 1.0, x, y)
 
 
-def _limit_of(residual: FloatArray, spread: float) -> float:
-    """Return the distance [m] from the smooth form beyond which a point is dust.
-
-    Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
-    """
-    common = float(np.quantile(np.abs(residual), 1 - _MOST_DUST))
-    return max(OUTLIER_SIGMAS * spread, _BEYOND_COMMON * common, _LEAST_LIMIT_M)
-
-
 def _coarse(
     surface: Surface,
     chosen: Portion,
@@ -182,7 +177,7 @@ def _coarse(
         if turn:
             middle = points.deviation - np.median(points.deviation)
             # Generous: what is left here is still the pose.
-            points = points.part(np.abs(middle) <= max(8 * scatter.spread(middle), _LEAST_LIMIT_M))
+            points = points.part(np.abs(middle) <= max(8 * scatter.spread(middle), LEAST_LIMIT_M))
         if len(points.x) < _LEAST_POINTS:
             break
         columns = -freedom_columns(at, points, names)
@@ -239,10 +234,9 @@ class _Fit:
         return found
 
     def sums(
-        self, at: Placement, portion: Portion, form: FloatArray, limit: float, sums: NormalEquations
-    ) -> FloatArray:
-        """Add a portion's points to ``sums``; return their distances from the smooth form."""
-        residuals = []
+        self, at: Placement, portion: Portion, like: FloatArray, limit: float, sums: NormalEquations
+    ) -> None:
+        """Add a portion's points to ``sums``, residuals from the sum ``like`` of columns."""
         for begin in range(0, len(portion.x), CHUNK):
             part = Portion(*(v[..., begin : begin + CHUNK] for v in portion))
             whole = placed(self.surface, at, part)
@@ -252,12 +246,10 @@ class _Fit:
             points = whole.part(good)
             systematic = part.systematic[:, good] * points.normal[2]
             z = self.basis.columns(points.x, points.y)
-            residual = points.deviation - form @ z
-            residuals.append(residual)
-            near = np.abs(residual) <= limit
             columns = np.concatenate([-freedom_columns(at, points, self.names), z])
+            residual = points.deviation - like @ columns
+            near = np.abs(residual) <= limit
             sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
-        return np.concatenate(residuals)
 
     def solved(self, sums: NormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
@@ -272,28 +264,40 @@ class _Fit:
         return found, variance
 
     def refine(self, at: Placement, chosen: Portion) -> tuple[Placement, FloatArray, float]:
-        """Return the placement that stands, the smooth form there, and the outliers' limit."""
-        form, limit = np.zeros(len(self.basis)), np.inf
-        for turn in range(_MOST_TURNS):
+        """Return the placement that stands, what columns are most like there, and the dust's limit.
+
+        Raises DataError if none does.
+        """
+        share, last = 1.0, np.zeros(len(self.names))
+        for turn in range(_MOST_REFINED):
+            points = _usable(placed(self.surface, at, chosen), self.aperture)
+            z = self.basis.columns(points.x, points.y)
+            columns = np.concatenate([-freedom_columns(at, points, self.names), z])
+            like, limit = most_like(columns, points.deviation)
+            residual = points.deviation - like @ columns
+            near = np.abs(residual) <= limit
+            none = np.empty((0, int(near.sum())))
             sums = self.new_sums(0)
-            residual = self.sums(at, chosen, form, limit, sums)
-            if turn == 0:
-                limit = max(2 * OUTLIER_SIGMAS * scatter.spread(residual), _LEAST_LIMIT_M)
-                continue
+            sums.add(columns[:, near], points.deviation[near], none, residual[near])
             found, _ = self.solved(sums)
-            at, form = at.moved(self.names, found.step), found.form
-            spread = scatter.spread(residual - np.median(residual))
-            limit = _limit_of(residual, spread)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
-            if turn > 3 and float(np.max(np.abs(found.step) * own)) < _SHARE_OF_SPREAD * spread:
-                break
-        return at, form, limit
+            step = found.step * own
+            settled = max(_SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
+            if turn > 3 and float(np.max(np.abs(step))) < settled:
+                smooth = np.concatenate([found.step, found.form]) @ columns
+                return at, like, limit_of(points.deviation - smooth)
+            share, last = relaxed(share, last, step), step
+            at = at.moved(self.names, share * found.step)
+        raise DataError(
+            "the pose does not settle: on these points it and the part's form look alike; hold "
+            "what need not be fitted, as --fit piston,tip,tilt"
+        )
 
 
 def _over_all(
     fit: _Fit,
     at: Placement,
-    form: FloatArray,
+    like: FloatArray,
     limit: float,
     portions: Portions,
     sources: Sequence[str],
@@ -304,7 +308,7 @@ def _over_all(
     sums = fit.new_sums(len(sources))
     square = points = 0.0
     for portion in portions():
-        fit.sums(at, portion, form, limit, sums)
+        fit.sums(at, portion, like, limit, sums)
         before = placed(fit.surface, Placement(), portion).deviation
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))

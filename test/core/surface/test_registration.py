@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from omsm_ros.core.surface import registration
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.freedoms import parsed_freedoms
 from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
@@ -22,6 +23,7 @@ from omsm_ros.core.surface.placement import (
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.core.surface.registration import register
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.twin.figure_error import FigureError
 from omsm_ros.twin.part_pose import PartPose, posed
 
 STRAIGHT = Pose()
@@ -205,6 +207,27 @@ def test_steps_of_the_part_are_no_dust():
     found = fitted(Flat(), portion, "piston,tip,tilt")
     points = placed(Flat(), found.placement, portion)
     assert np.mean(found.good(points)) > 0.95
+
+
+@pytest.mark.parametrize("size", [80e-9, 120e-9, 300e-9])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_small_piece_settles_though_its_form_looks_like_a_pose(size, seed):
+    """Over 3 mm form and shift are one: steps of 0.2 mm, which bend what lies between them."""
+    part = FigureError(PAPER_MIRROR, 3e-3, seed=seed, astigmatism=size)
+    x, y = (v * 3e-3 / RADIUS for v in spiral(20_000, 30))
+    noise = np.random.default_rng(seed).normal(0, NOISE, len(x))
+    portion = Portion(x, y, part.height(x, y) + noise, np.empty((0, len(x))))
+    found = fitted(PAPER_MIRROR, portion)
+    assert found.noise == pytest.approx(NOISE, rel=0.1)
+    assert np.mean(found.good(placed(PAPER_MIRROR, found.placement, portion))) > 0.999
+    for name in found.freedoms.fitted:
+        assert abs(found.placement.value(name)) < 2 * found.uncertainty(name)
+
+
+def test_a_pose_that_does_not_settle_is_refused_with_the_remedy(monkeypatch):
+    monkeypatch.setattr(registration, "_MOST_REFINED", 2)
+    with pytest.raises(DataError, match=r"does not settle.*--fit piston,tip,tilt"):
+        fitted(PAPER_MIRROR, scan(PAPER_MIRROR))
 
 
 def test_a_systematic_source_moves_the_pose_by_what_it_says():
