@@ -206,6 +206,14 @@ def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
     assert found["pose"]["tip"]["value"] == pytest.approx(2e-3, abs=1e-7)
 
 
+def test_a_scan_without_its_calibration_is_told_from_a_map(folder, tmp_path, capsys):
+    bag = tmp_path / "scan.mcap"
+    bag.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    words = ["form", bag, "--nominal", folder / "mirror.yaml", "--out", tmp_path / "out"]
+    assert main([str(word) for word in words]) == 2
+    assert "is a bag, no map" in capsys.readouterr().err
+
+
 def test_a_move_that_hides_the_form_is_advised_against(folder, tmp_path):
     """Over a small disc a shift and astigmatism are one; held, the same points say much more."""
     words = ("--aperture", RADIUS / 6)

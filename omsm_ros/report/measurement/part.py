@@ -37,6 +37,7 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
             for key, name in _FIGURES.items()
             if part(deviation, key, "value") is not None
         ]
+        told += part(form, "removed", "notes") or ()
     elif raw := part(summary, "deviation", "corrected"):
         told = [
             f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",

@@ -17,6 +17,7 @@ from omsm_ros.storage.maps.vertex_file import read_pcd, read_ply
 from omsm_ros.storage.maps.x3p_file import read_x3p
 
 _HEAD_BYTES = 4096
+_BAG = b"\x89MCAP0\r\n"
 _GRID_SAG_SUFFIXES = (".dat", ".grd")
 _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
@@ -35,11 +36,22 @@ def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
         raise FileError(f"map {str(file)!r}: {err}") from err
 
 
-def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+def _head(path: Path) -> bytes:
+    """Return how a file begins; refuse one that is empty, or a bag."""
     with open_regular(path, FileError, "map") as stream:
         head = stream.read(_HEAD_BYTES)
     if not head:
         raise FileError(f"map {str(path)!r} is empty")
+    if head.startswith(_BAG):
+        raise FileError(
+            f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
+            "'omsm form' its --calibration, too"
+        )
+    return head
+
+
+def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    head = _head(path)
     if head.startswith((b"ply\n", b"ply\r\n")):
         return read_ply(path, units)
     if head.startswith((b"# .PCD", b"VERSION")):

@@ -92,6 +92,11 @@ def test_without_a_nominal_surface_there_is_no_verdict_on_the_part():
     assert not removed_table({}, {}).rows
 
 
+def test_what_would_say_more_is_told_with_the_figures():
+    form = {**FORM, "removed": {**FORM["removed"], "notes": ["hold it: --fit piston,tip,tilt"]}}
+    assert "hold it: --fit piston,tip,tilt" in verdict_on_part(summary(), form).reasons
+
+
 def test_what_was_taken_out_has_units_and_reasons():
     rows = [tuple(c.replace("\u202f", " ") for c in r) for r in removed_table({}, FORM).rows]
     assert rows[0] == ("piston", "1.50 nm", "0.200 nm")
