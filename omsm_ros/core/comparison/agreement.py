@@ -19,11 +19,13 @@ from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
 
+# Of some 95 % (GUM 6.3.3).
 COVERAGE_FACTOR = 2.0
 TERMS: tuple[Term, ...] = terms_up_to(6, 2)
 ROBUST_SHARE = 0.995
 
 _TOGETHER = 0.95
+# A share of 95 % of so many draws is known to 1.3 %, one of 99 % to 0.6 %.
 _DRAWS = 300
 # Above it the width of the filter is no whole place.
 _HARDLY_SMOOTHED = 0.7

@@ -12,6 +12,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 from omsm_ros.readable import quantity
 
+# The orders that are judged; left in, they would bend within a cell.
 _TREND_DEGREE = 6
 _TREND_POINTS = 20_000
 # Twice as large cells are a quarter as many where the points fill the surface.

@@ -13,6 +13,8 @@ from scipy.linalg import cholesky, solve_triangular
 from omsm_ros.core.correction.unknown_curves import components, random_walk
 from omsm_ros.core.samples.blocks import FloatArray
 
+# Of an error correlated over half the radius of a disc 18 shapes hold what is kept, over a quarter
+# 54, as with four times as many nodes.
 _NODES = 400
 _LEFT_OUT = 0.005
 _DRIFTS_M = np.geomspace(1e-11, 1e-5, 121)

@@ -29,6 +29,7 @@ Rows = Callable[[int, int], FloatArray]
 RADIUS_CELLS = 2.4
 """Radius of a local fit in sides of a cell: some eighteen cells for six coefficients."""
 
+# Half as many again as a quadratic has coefficients.
 _LEAST_NEIGHBOURS = 9
 # A place at the straight edge of evenly spread cells has its tricube-weighted centre 0.30 radii
 # inside; farther out than that a fit extrapolates.

@@ -14,6 +14,7 @@ import numpy as np
 from omsm_ros.core.form.figures import DeviationMap
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 
+# Eight points leave a third of their noise in a cell (1/√8).
 _MOST_ACROSS, _POINTS_PER_CELL = 256, 8.0
 # Of the weighting function exp(−π (x / α λ)²): half of a sine of wavelength λ passes.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))

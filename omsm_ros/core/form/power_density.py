@@ -15,6 +15,7 @@ import numpy as np
 from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.samples.blocks import FloatArray
 
+# Of half a turn, five degrees each: the other half is the same.
 _SECTORS = 36
 _NOISE_SEED = 22
 

@@ -33,6 +33,7 @@ from omsm_ros.core.spectra.line import (
 from omsm_ros.core.spectra.noise_floor import ratio_at, significance
 from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 
+# Noise alone shows such a line in one spectrum of 740.
 LEAST_SIGMA = 3.0
 MOST_LINES = 40
 # Of the strongest that is left: weaker ones may be its side lobes.

@@ -42,7 +42,9 @@ from omsm_ros.core.surface.placement import (
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
 
+# Points at a time: 7 freedoms and 42 polynomials of each are 6 MB.
 CHUNK = 16_384
+# Four points for each of these columns are the least.
 _MOST_SELECTED, _LEAST_POINTS = 40_000, 200
 _MOST_TURNS, _MOST_REFINED = 30, 30
 _ENOUGH_FOR_A_CURVE = 2000
