@@ -122,10 +122,8 @@ def _poses(runs: int) -> list[Row]:
                 spread = registration.uncertainty(name)
                 off = registration.placement.value(name) - getattr(pose, name)
                 held.append(spread is not None and abs(off) <= 2 * spread)
-            # Beside the same noise on a part that sits straight, where all poses have points: in
-            # the crescent beyond few stand for all, and 5 nm of their noise are in the terms.
-            inner = np.hypot(found.map.x, found.map.y) < RADIUS - SHIFT
-            place = found.map.x[inner], found.map.y[inner]
+            # Beside the same noise on a part that sits straight.
+            place = found.map.x, found.map.y
             there, height = straight.height(*place), found.zernike.height(*place)
             added.append(float(np.ptp(height - there)))
     total = 3 * runs

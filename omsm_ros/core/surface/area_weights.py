@@ -2,7 +2,8 @@
 
 Read off the scan as it ran. Where the path turns about the spindle, a point stands for the arc that
 it covers, ``r |Δθ|``, whatever the speed was and however many points beside it were lost; each ring
-of equal area and a few turns counts alike, whatever the feed was while it was crossed. Elsewhere
+of equal area and a few turns counts alike, whatever the feed was while it was crossed, and one that
+was seen in part, as at the rim of a part beside the spindle's axis, by that part. Elsewhere
 each cell of a grid counts alike that is as fine as the tracks allow.
 """
 
@@ -17,8 +18,11 @@ _LEAST_TURNS = 2.0
 # Rings so fine that the rim is a thousandth of the area, of whole turns and points enough for a
 # mean.
 _MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
-# Across a gap larger than this nobody has looked, and no point stands for it [rad].
-_LARGEST_ARC = np.pi / 6
+# Across a gap larger than this nobody has looked, and no point stands for it: as an angle [rad],
+# and in steps of the path. A single point that stood for 30° of a turn of 2000 points would bring
+# its noise into every figure.
+_LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
+_SECTORS = 12
 # The side of a grid; the number of its cells falls to a quarter as their size doubles where they
 # fill the surface, and to a half where they lie along single tracks.
 _MOST_CELLS, _FILLED = 512, 3.5
@@ -37,6 +41,7 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
     if turned >= _LEAST_TURNS:
         group, area = _rings(x, y, turned)
         share = _arcs(np.hypot(x, y), angle)
+        area = area * _covered(group, angle, len(area))
     else:
         group, area = _cells(x, y)
     whole = np.bincount(group, share, minlength=len(area))
@@ -65,11 +70,26 @@ def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, Float
 
 def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
     """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
-    steps = np.minimum(np.abs(np.diff(angle)), _LARGEST_ARC)
+    steps = np.abs(np.diff(angle))
+    steps = np.minimum(steps, min(_MOST_STEPS * float(np.median(steps)), _LARGEST_ARC))
     covered = np.empty(len(angle))
     covered[0], covered[-1] = steps[0], steps[-1]
     covered[1:-1] = (steps[1:] + steps[:-1]) / 2
     return np.asarray(radius * covered, np.float64)
+
+
+def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
+    """Return the share of each of ``count`` rings that the path has seen (count,), by sectors.
+
+    Where the feed is fast a ring is crossed within half a turn; then those beside it see the rest.
+    """
+    sector = np.floor(angle * (_SECTORS / (2 * np.pi))).astype(np.int64) % _SECTORS
+    points = np.bincount(group * _SECTORS + sector, minlength=count * _SECTORS)
+    seen = points.reshape(count, _SECTORS) > 0
+    around = seen.copy()
+    around[1:] |= seen[:-1]
+    around[:-1] |= seen[1:]
+    return np.asarray(np.mean(around, axis=1), np.float64)
 
 
 def _cells(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:

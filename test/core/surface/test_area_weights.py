@@ -76,6 +76,30 @@ def test_within_a_turn_each_part_of_it_counts_by_its_area(path) -> None:
     assert np.average(x**2, weights=weights) == pytest.approx(RADIUS**2 / 4, rel=0.01)
 
 
+@pytest.mark.parametrize("clipped", [False, True])
+@pytest.mark.parametrize("off", [(0.04, 0.0), (-0.02, 0.03)])
+def test_beside_the_axis_a_rim_seen_in_part_counts_by_that_part(off, clipped) -> None:
+    """The part's centre is half a millimetre off: of its rim the scan sees a crescent."""
+    dx, dy = (RADIUS * share for share in off)
+    x, y = (v - d for v, d in zip(spiral(254_000), (dx, dy), strict=True))
+    seen = np.hypot(x, y) <= (RADIUS if clipped else np.inf)
+    x, y = x[seen], y[seen]
+    weights = area_weights(x, y)
+    # No point stands for a hundred others.
+    assert weights.max() < 20
+    assert weights[weights > 5].sum() < 1e-3 * weights.sum()
+    assert np.mean(weights) ** 2 / np.mean(weights**2) > 0.7
+    # What evenly laid places say of the same region.
+    line = np.linspace(-1.1 * RADIUS, 1.1 * RADIUS, 1500)
+    u, v = (axis.ravel() for axis in np.meshgrid(line, line))
+    inside = np.hypot(u + dx, v + dy) <= RADIUS
+    inside &= np.hypot(u, v) <= (RADIUS if clipped else np.inf)
+    for form in (lambda x, y: x, lambda x, y: y, lambda x, y: x * x + y * y):
+        truth = np.mean(form(u[inside] / RADIUS, v[inside] / RADIUS))
+        found = np.average(form(x / RADIUS, y / RADIUS), weights=weights)
+        assert found == pytest.approx(truth, abs=0.02)
+
+
 def test_speed_and_feed_would_mislead_by_a_tenth() -> None:
     x, y = constant_surface_speed()
     assumed = np.hypot(x, y)
