@@ -189,6 +189,10 @@ PERIOD = Quantity("period", "m", 1e-9, 100.0, "give it in metres")
 CORRELATION_TIME = Quantity("correlation time", "s", 1e-3, 1e7, "give it in seconds")
 LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
 
+COUNTER_OFFSET = Quantity(
+    "counter offset", "samples", -(2**53), 2**53, "give it in samples", whole=True
+)
+STAMP_TOLERANCE = Quantity("stamp tolerance", "s", 0.0, 10.0, "give it in seconds")
 STAMP_DELAY = Quantity("delay of the exposure", "s", -10.0, 10.0, "give it in seconds")
 EXPOSURE = Quantity("exposure", "s", 0.0, 10.0, "give it in seconds")
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import Quantity, shown
+from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
@@ -80,3 +81,26 @@ def _topics(text: str) -> dict[str, str]:
 def cell_of(path: Path, args: argparse.Namespace) -> AnyBag:
     """Return the bag at ``path``, with the cell that was asked for of :func:`add_cell`."""
     return CellBag(path, args.namespace, args.topics) if args.namespace or args.topics else path
+
+
+def add_trigger(sub: argparse.ArgumentParser) -> None:
+    """Declare what is stated of the counters of axes and probe."""
+    sub.add_argument(
+        "--counter-offset",
+        type=number(COUNTER_OFFSET),
+        default=0,
+        metavar="SAMPLES",
+        help="added to the distance's trigger count, it gives the axes' count",
+    )
+    sub.add_argument(
+        "--stamp-tolerance",
+        type=number(STAMP_TOLERANCE),
+        default=TWO_DRIVERS_S,
+        metavar="S",
+        help="by how much axes and probe may stamp one trigger differently [s]",
+    )
+
+
+def trigger_of(args: argparse.Namespace) -> CommonTrigger:
+    """Return what is stated of the counters."""
+    return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_cell, cell_of, json_object, number
+from omsm_ros.cli.arguments import add_cell, add_trigger, cell_of, json_object, number, trigger_of
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
@@ -68,6 +68,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
+    add_trigger(sub)
     sub.add_argument(
         "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
     )
@@ -87,6 +88,7 @@ def _identify(args: argparse.Namespace) -> Facts:
             cell_of(args.recording, args),
             duration=args.duration,
             time_lapse=(args.settings or {}).get("time_lapse", 1.0),
+            trigger=trigger_of(args),
             progress=progress,
         )
     if args.hold != BAND_LIMITED:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_cell, cell_of, json_object, number
+from omsm_ros.cli.arguments import add_cell, add_trigger, cell_of, json_object, number, trigger_of
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
@@ -80,6 +80,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--exposure", type=number(quantities.EXPOSURE), default=0.0, help="of the probe [s]"
     )
+    add_trigger(sub)
     sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
     sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
     sub.add_argument(
@@ -123,6 +124,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         lateral_lag=args.lateral_lag,
         geometry=geometry_of(args.geometry),
         pitch=load_pitch(args.pitch) if args.pitch else None,
+        trigger=trigger_of(args),
     )
     if options.pitch is not None and not options.geometry.abbe_arm:
         raise ConfigurationError(

@@ -122,12 +122,15 @@ class _Findings:
         self.path.add(block)
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
-    def faults(self, period: float) -> tuple[str, ...]:
+    def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
         """What counters and stamps say; those of axes that were joined by stamps are not theirs."""
         found = [*self._distance.faults("distance")]
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)
-            found = [*self._axes.faults("axes"), *found, *skew_fault(skew, period)]
+            found = [*self._axes.faults("axes"), *found]
+            found += skew_fault(skew, scan.sample_period, scan.trigger)
+            samples = scan.account.distance.counted.get("slipped", 0)
+            found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)
         return tuple(found)
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
@@ -161,5 +164,5 @@ def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
         trace=scan.trace,
         path=found.path.path(),
         sample_period=scan.sample_period,
-        faults=found.faults(scan.sample_period),
+        faults=found.faults(scan),
     )

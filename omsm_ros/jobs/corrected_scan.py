@@ -17,6 +17,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
+from omsm_ros.core.samples.slips import CommonTrigger, Slip
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
@@ -138,6 +139,16 @@ class CorrectedScan:
     def stamp_skew(self) -> float | None:
         """Time of the axes minus time of the distance at the newest common trigger [s]."""
         return self._corrector.stamp_skew
+
+    @property
+    def slip(self) -> Slip | None:
+        """The last slip of the two counters so far, None without one."""
+        return self._corrector.slips.found
+
+    @property
+    def trigger(self) -> CommonTrigger:
+        """What is stated of the two counters."""
+        return self._options.trigger
 
     def _blocks(self, bag: bags.BagReader) -> Iterator[Any]:
         total = bag.count(TOPICS)

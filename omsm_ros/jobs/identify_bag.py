@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
@@ -19,14 +20,16 @@ def motion_of_bag(
     *,
     duration: float = 0.0,
     time_lapse: object = 1.0,
+    trigger: CommonTrigger = EQUAL_COUNTS,
     progress: Progress = no_progress,
 ) -> MotionRecord:
     """The motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
 
     time_lapse: how much faster than real time the recording was played [1]
+    trigger: what is stated of the counters of axes and distance
     The reference sensor is used where it was recorded.
 
-    Raises DataError where the stamps contradict the sample period.
+    Raises DataError where the stamps contradict the sample period, or the counters each other.
     """
     faster = TIME_LAPSE.checked(time_lapse, ConfigurationError, "time_lapse")
     topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
@@ -39,7 +42,7 @@ def motion_of_bag(
     axes, distance, *reference = (_beginning(blocks[topic], duration) for topic in topics)
     for name, stream in (("axis", axes), ("distance", distance)):
         check_period(name, stream, faster)
-    return assemble(axes, distance, *reference)  # type: ignore[arg-type]
+    return assemble(axes, distance, *reference, trigger=trigger)  # type: ignore[arg-type]
 
 
 def _beginning(blocks: list[Block], duration: float) -> list[Block]:

@@ -22,6 +22,7 @@ from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
+from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
@@ -37,6 +38,7 @@ PARAMETERS = (
     ),
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
     Parameter("settings", "{}", "JSON object of what the calibration belongs to"),
+    *TRIGGER,
 )
 _STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceBlock}
 
@@ -51,6 +53,7 @@ class CalibratorNode(ManagedNode):
     def configure(self, undo: ExitStack) -> None:
         """Take up what was in force, and answer requests."""
         self._settings = settings_of(self.values["settings"])
+        self._trigger = trigger_of(self.values)
         self._folder = CalibrationFolder(Path(self.values["output"]))
         capacity = self.values["buffer_samples"]
         self._buffers: dict[str, BlockBuffer[Any]] = {
@@ -165,14 +168,16 @@ class CalibratorNode(ManagedNode):
         return lambda: identify(motion(), order=order, input=source, settings=settings)
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
-        return motion_of_bag(bag, duration=duration, time_lapse=self._time_lapse)
+        return motion_of_bag(
+            bag, duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
+        )
 
     def _live_motion(self, *streams: list[Any]) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
         if faster == 1.0:  # a time lapse is as even as the computer that plays it
             for name, blocks in zip(_STREAMS, streams, strict=True):
                 check_period(name, blocks)
-        return assemble(*streams)
+        return assemble(*streams, trigger=self._trigger)
 
     @property
     def _time_lapse(self) -> object:

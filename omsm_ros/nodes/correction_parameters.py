@@ -15,6 +15,7 @@ from omsm_ros.core.correction.machine_sources import (
 )
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.parameters import Parameter
 from omsm_ros.quantities import Quantity
 from omsm_ros.storage.sources_file import load_sources
@@ -27,6 +28,20 @@ _SOURCE_OF: dict[str, Quantity] = {
     "pitch": quantities.ANGLE_UNCERTAINTY,
 }
 
+TRIGGER = (
+    Parameter(
+        "counter_offset",
+        0,
+        "added to the distance's trigger count, it gives the axes' count [samples]",
+        quantities.COUNTER_OFFSET,
+    ),
+    Parameter(
+        "stamp_tolerance",
+        TWO_DRIVERS_S,
+        "by how much axes and probe may stamp one trigger differently [s]",
+        quantities.STAMP_TOLERANCE,
+    ),
+)
 PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
@@ -45,6 +60,7 @@ PARAMETERS = (
         quantities.LAG,
         unset=_AS_CALIBRATED,
     ),
+    *TRIGGER,
     Parameter("workpiece_frame", "workpiece", "frame of the points"),
     Parameter("machine_frame", "machine", "frame of the axes"),
     Parameter("probe_frame", "probe", "frame of the distance"),
@@ -84,7 +100,15 @@ def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
         polarity=values["polarity"],
         accept_other_rate=values["override"],
         lateral_lag=None if lag == _AS_CALIBRATED else lag,
+        trigger=trigger_of(values),
         geometry=Geometry(**{f.name: values[f"geometry.{f.name}"] for f in fields(Geometry)}),
+    )
+
+
+def trigger_of(values: Mapping[str, Any]) -> CommonTrigger:
+    """Return what is stated of the trigger that probe and axes count."""
+    return CommonTrigger(
+        counter_offset=values["counter_offset"], stamp_tolerance=values["stamp_tolerance"]
     )
 
 

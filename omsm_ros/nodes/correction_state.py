@@ -67,6 +67,10 @@ class CorrectionState:
             return report
         report.values |= self.load.report(cpu, now)
         report.values["stamp_skew_s"] = corrector.stamp_skew
+        slip = corrector.slips.state
+        report.values |= {"slip_samples": slip.samples, "slip_seen_from_samples": slip.seen_from}
+        if slip.samples:
+            report.add(ERROR, f"not corrected: {slip}")
         report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}
         self._add_losses(report, self._account(report, corrector), now)
         waited = self.load.worst_ms()

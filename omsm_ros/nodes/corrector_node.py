@@ -16,7 +16,7 @@ from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.merging import merged
+from omsm_ros.core.samples.merging import consecutive
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.jobs.predict_motion import predict_from
@@ -157,11 +157,11 @@ class CorrectorNode(ManagedNode):
         if self._corrector is None:
             return
         push: Any = self._corrector.push_axes if stream == "axes" else self._corrector.push_distance
-        for block in merged(blocks):
+        for together in consecutive(blocks):
             try:
-                push(block)
+                push(*together)
             except OmsmError as err:
-                self._refuse(stream, len(block), err)
+                self._refuse(stream, sum(map(len, together)), err)
         if (points := self._corrector.take()) is not None:
             self._publish(points)
         self._state.done(time.time_ns())

@@ -34,7 +34,9 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import Arrival
+from omsm_ros.core.samples.merging import joined
 from omsm_ros.core.samples.pairing import Intake, Pairing, Run
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -59,6 +61,7 @@ class CorrectionOptions:
         can be known of it there: what shifts points sideways, only with a ``surface``
     surface: nominal, for its slopes
     pitch: of Z, measured; over the geometry's Abbe arm it is taken off the encoder
+    trigger: what is stated of the counters of the two streams
     """
 
     polarity: int = 1
@@ -71,6 +74,7 @@ class CorrectionOptions:
     systematic: tuple[SystematicSource, ...] = ()
     surface: Surface | None = None
     pitch: PitchCurve | None = None
+    trigger: CommonTrigger = EQUAL_COUNTS
 
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
@@ -105,13 +109,12 @@ class Corrector:
         self._static_gain = options.static_gain or calibration.static_gain
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
-        self._axes, self._distance = Intake(), Intake()
-        self._pairing = Pairing(self._axes.tally, self._distance.tally)
+        self._axes, self._distance = Intake(), Intake(options.trigger.counter_offset)
+        self._pairing = Pairing(self._axes, self._distance, options.trigger)
         self._motion: MotionFilter | None = None
         self._noise_gain = 1.0
         self._variance: defaultdict[str, float] = defaultdict(float)
         self._ready: list[SurfacePoints] = []
-        self._stamp_skew: float | None = None
         self._systematic = [
             source
             for source in options.systematic
@@ -119,25 +122,27 @@ class Corrector:
         ]
         self.trace = ScanTrace()
 
-    def push_axes(self, block: AxisBlock) -> None:
-        """Filter the encoder's samples of a block.
+    def push_axes(self, *blocks: AxisBlock) -> None:
+        """Filter the encoder's samples of a block, or of several that follow on, at once.
 
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
+        block = joined(blocks)
         motion = self._filter_for(block)
-        if (arrival := self._axes.new(block)) is not None:
+        if (arrival := self._axes.new(block, blocks)) is not None:
             for run in motion.push(_axes_run(block, arrival)):
                 self._pairing.axes.push(run)
             self._join()
             self._pairing.axes.limit(self._most_pending(block))
 
-    def push_distance(self, block: DistanceBlock) -> None:
-        """Queue the probe's readings of a block.
+    def push_distance(self, *blocks: DistanceBlock) -> None:
+        """Queue the probe's readings of a block, or of several that follow on, at once.
 
         Raises CalibrationError for a sample period the calibration does not hold for.
         """
+        block = joined(blocks)
         self._filter_for(block)
-        if (arrival := self._distance.new(block)) is not None:
+        if (arrival := self._distance.new(block, blocks)) is not None:
             self._pairing.distance.push(_distance_run(block, arrival))
             self._join()
             self._pairing.distance.limit(self._most_pending(block))
@@ -181,7 +186,12 @@ class Corrector:
 
         Large or drifting, it tells of devices that count different triggers.
         """
-        return self._stamp_skew
+        return self._pairing.stamp_skew
+
+    @property
+    def slips(self) -> SlipWatch:
+        """Whether the two counters have slipped against each other, and by how much."""
+        return self._pairing.watch
 
     @property
     def budget(self) -> dict[str, float]:
@@ -220,7 +230,6 @@ class Corrector:
 
     def _join(self) -> None:
         for axes, distance in self._pairing.pairs():
-            self._stamp_skew = (axes.stamp_ns - distance.stamp_ns) / NANOSECONDS_PER_S
             points = self._points(axes, distance)
             if len(points):
                 self._ready.append(points)

@@ -25,6 +25,7 @@ class Reason(IntEnum):
     SETTLING: the filter had just started
     OVERDUE: waited for its partner, or for whom its partner waited, longer than is allowed
     BEYOND: taken where no member of the calibration set knows the dynamics
+    SLIPPED: the counters of the two streams no longer count the same triggers
     """
 
     NONE = 0
@@ -35,6 +36,7 @@ class Reason(IntEnum):
     SETTLING = 5
     OVERDUE = 6
     BEYOND = 7
+    SLIPPED = 8
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,11 @@ _STAMP_TOLERANCE_S = 1e-3
 _NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
 
 
-def merged(blocks: Sequence[B]) -> list[B]:
-    """Return blocks of the same samples in the same order, those joined that follow on.
+def consecutive(blocks: Sequence[B]) -> list[list[B]]:
+    """Return the blocks in their order, those in one list that can be joined.
 
-    Joined are blocks with consecutive counts, one period, the same channels, and stamps that
-    continue the first one's.
+    They have consecutive counts, one period, the same channels, and stamps that continue the
+    first one's.
     """
     runs: list[list[B]] = []
     length = 0
@@ -36,7 +36,7 @@ def merged(blocks: Sequence[B]) -> list[B]:
         else:
             runs.append([block])
             length = len(block)
-    return [run[0] if len(run) == 1 else _joined(run) for run in runs]
+    return runs
 
 
 def _continues(first: B, length: int, block: B) -> bool:
@@ -56,7 +56,10 @@ def _channels(block: B) -> tuple[str, ...]:
     return tuple(f.name for f in fields(block) if f.name not in _NO_CHANNELS)
 
 
-def _joined(run: Sequence[B]) -> B:
+def joined(run: Sequence[B]) -> B:
+    """Return one block of the samples of several that follow on, with the first one's stamp."""
+    if len(run) == 1:
+        return run[0]
     return replace(
         run[0],
         **{

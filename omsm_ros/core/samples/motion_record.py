@@ -13,10 +13,11 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from omsm_ros.core.samples.accounts import Reason, StreamAccount, Tally
+from omsm_ros.core.samples.accounts import Reason, StreamAccount
 from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import SAMPLE_PERIOD
 
@@ -99,10 +100,12 @@ def assemble(
     axes: Sequence[AxisBlock],
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock] = (),
+    trigger: CommonTrigger = EQUAL_COUNTS,
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
 
-    Raises DataError when nothing can be paired, or when it is more than one recording.
+    Raises DataError when nothing can be paired, when it is more than one recording, or when the
+    counters of axes and distance slipped against each other.
     """
     if not axes or not distance:
         raise DataError(
@@ -112,7 +115,7 @@ def assemble(
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
     if abs(probe_period / period - 1) < _SAME_PERIOD:
-        return _by_counter(axes, distance, reference, period)
+        return _by_counter(axes, distance, reference, period, trigger)
     return _by_stamp(axes, distance, reference)
 
 
@@ -176,12 +179,16 @@ class _Grid:
         return cls(runs, first, z, known, intake.tally.snapshot(0))
 
     def matched(
-        self, blocks: Sequence[DistanceBlock]
+        self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
     ) -> tuple[FloatArray, BoolArray, StreamAccount]:
-        """Readings on the grid (n,), where they are usable, and where all of them have gone."""
-        intake = Intake()
-        pairing = Pairing(Tally(), intake.tally)
+        """Readings on the grid (n,), where they are usable, and where all of them have gone.
+
+        Raises DataError where their counter slipped against that of the axes.
+        """
+        axes, intake = Intake(), Intake(trigger.counter_offset)
+        pairing = Pairing(axes, intake, trigger)
         for run in self.runs:
+            axes.stamps.add(run.session, run.first, run.stamp_ns)
             pairing.axes.push(run)
         for run in _runs(blocks, _reading, intake):
             pairing.distance.push(run)
@@ -191,6 +198,8 @@ class _Grid:
             usable = reading.reasons == Reason.NONE
             seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable
         pairing.distance.clear()
+        if pairing.watch.found is not None:
+            raise DataError(f"{name}: {pairing.watch.found}")
         return seen, ok, intake.tally.snapshot(0)
 
 
@@ -199,9 +208,10 @@ def _by_counter(
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock],
     period: float,
+    trigger: CommonTrigger = EQUAL_COUNTS,
 ) -> MotionRecord:
     grid = _Grid.of(axes)
-    seen, ok, account = grid.matched(distance)
+    seen, ok, account = grid.matched("distance", distance, trigger)
     lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
     if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
@@ -209,12 +219,13 @@ def _by_counter(
             f"{distance[0].first_sample} share no trigger count at the same time: they are not of "
             f"one recording, or their stamps differ by more than {STAMP_TOLERANCE_S} s"
         )
+    own = replace(trigger, counter_offset=0)
     return MotionRecord(
         sample_period=period,
         z=_filled(grid.z, grid.known),
         distance=seen,
         ok=grid.known & ok,
-        reference=grid.matched(reference)[0] if reference else None,
+        reference=grid.matched("reference", reference, own)[0] if reference else None,
         z_lost=None if np.all(grid.known) else ~grid.known,
         counts=_counts(grid, account),
     )

@@ -6,14 +6,15 @@ already passed will never find its partner. Every decision rests on the two head
 so the outcome does not depend on how the streams were interleaved or cut.
 
 Sessions are counted by each stream for itself. The first pair with the same count *and* the
-same time links a session of one stream to a session of the other.
+same time links a session of one stream to a session of the other. From then on their stamps
+are watched: pairs whose counts slipped against each other are none.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.samples.accounts import Reason, Tally
 from omsm_ros.core.samples.blocks import Block, FloatArray
 from omsm_ros.core.samples.continuity import Arrival, TriggerCount
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch, StampLine
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
@@ -48,7 +50,7 @@ class Run:
         cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
     ) -> Run:
         """What is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
-        period_ns = block.sample_period * NANOSECONDS_PER_S
+        period_ns = _period_ns(block)
         whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
         return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
 
@@ -77,20 +79,41 @@ class Run:
 
 
 class Intake:
-    """One stream's blocks on their way to a partner: what is new of each, what is counted."""
+    """One stream's blocks on their way to a partner: what is new of each, what is counted.
 
-    def __init__(self) -> None:
+    offset: added to the stream's trigger counts;  stamps: of its blocks
+    """
+
+    def __init__(self, offset: int = 0) -> None:
         self.tally = Tally()
+        self.stamps = StampLine()
+        self._offset = offset
         self._count = TriggerCount()
 
-    def new(self, block: Block) -> Arrival | None:
-        """Count the samples of ``block``; None if all were there before, or came too late."""
+    def new(self, block: Block, parts: Sequence[Block] = ()) -> Arrival | None:
+        """Count the samples of ``block``; None if all were there before, or came too late.
+
+        parts: the blocks it was joined of, each with a stamp of its own
+        """
         arrival = self._count.place(block, len(block))
         self.tally.received += len(block)
         self.tally.missing = max(self.tally.missing + arrival.missing - arrival.late, 0)
         self.tally.count(Reason.LATE, arrival.late)
         self.tally.count(Reason.DUPLICATE, arrival.skip - arrival.late)
-        return arrival if arrival.skip < len(block) else None
+        if arrival.skip == len(block):
+            return None
+        arrival = replace(arrival, first=arrival.first + self._offset)
+        for part in parts or (block,):
+            self._note(part, arrival)
+        return arrival
+
+    def _note(self, block: Block, arrival: Arrival) -> None:
+        """Keep the stamp of what is new of ``block``."""
+        first = block.first_sample + self._offset
+        skip = max(arrival.first + arrival.skip - first, 0)
+        if skip < len(block):
+            stamp_ns = block.stamp_ns + round(skip * _period_ns(block))
+            self.stamps.add(arrival.session, first + skip, stamp_ns)
 
     def end(self) -> None:
         """Whatever comes next begins a session."""
@@ -101,9 +124,11 @@ class Queue:
     """Runs of one stream that wait for a partner.
 
     given_up: the newest samples that waited too long
+    stamps: of the blocks they came in
     """
 
-    def __init__(self, tally: Tally) -> None:
+    def __init__(self, tally: Tally, stamps: StampLine) -> None:
+        self.stamps = stamps
         self.pending = 0
         self.given_up: Run | None = None
         self._runs: deque[Run] = deque()
@@ -122,6 +147,7 @@ class Queue:
     def drop(self, samples: int, reason: Reason = Reason.UNMATCHED) -> Run:
         """Take the oldest ``samples`` of the head, which have no partner for ``reason``."""
         run = self._cut(samples)
+        self.stamps.advance(run.session, run.end - 1)
         self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
         return run
 
@@ -163,11 +189,18 @@ class _Link:
 
 
 class Pairing:
-    """Joins the two queues."""
+    """Joins the two queues.
 
-    def __init__(self, axes: Tally, distance: Tally) -> None:
-        self.axes = Queue(axes)
-        self.distance = Queue(distance)
+    stamp_skew: time of the axes less time of the distance at the newest common count [s]
+    """
+
+    def __init__(
+        self, axes: Intake, distance: Intake, trigger: CommonTrigger = EQUAL_COUNTS
+    ) -> None:
+        self.axes = Queue(axes.tally, axes.stamps)
+        self.distance = Queue(distance.tally, distance.stamps)
+        self.stamp_skew: float | None = None
+        self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
         self._link = _Link(-1, -1)
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
@@ -181,11 +214,23 @@ class Pairing:
                 samples = self._leading(d, a.first, a, d)
                 self.distance.drop(samples, _missing(d, self.axes))
             else:
-                samples = min(len(a), len(d))
+                yield from self._joined(a, d)
+
+    def _joined(self, a: Run, d: Run) -> Iterator[tuple[Run, Run]]:
+        """The pairs that two heads of equal count make, but for those that have slipped."""
+        self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
+        start, end = 0, a.first + min(len(a), len(d))
+        for until, slipped in self.watch.spans((a.session, d.session), a.first, end, a.period_ns):
+            stop = until - a.first
+            if slipped:
+                self.axes.drop(stop - start, Reason.SLIPPED)
+                self.distance.drop(stop - start, Reason.SLIPPED)
+            else:
                 yield (
-                    self.axes.pair(samples, d.reasons[:samples]),
-                    self.distance.pair(samples, a.reasons[:samples]),
+                    self.axes.pair(stop - start, d.reasons[start:stop]),
+                    self.distance.pair(stop - start, a.reasons[start:stop]),
                 )
+            start = stop
 
     def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
         """Samples of ``run`` before the other head, all of them if the sessions differ."""
@@ -225,6 +270,10 @@ def _missing(run: Run, other: Queue) -> Reason:
     lost = other.given_up
     overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
     return Reason.OVERDUE if overdue else Reason.UNMATCHED
+
+
+def _period_ns(block: Block) -> float:
+    return block.sample_period * NANOSECONDS_PER_S
 
 
 def _sign(value: float) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
 
 # Places that are named; of more, the number.
@@ -109,9 +110,17 @@ def counter_skew(axes: StreamWatch, distance: StreamWatch) -> float | None:
     return float(np.median(found)) if found else None
 
 
-def skew_fault(skew: float | None, period: float) -> Iterator[str]:
-    """Yield what a skew of the counters [s] means, if it is one, in words for people."""
-    if skew is not None and abs(skew) > _SKEW_SAMPLES * period:
+def skew_fault(
+    skew: float | None, period: float, trigger: CommonTrigger = EQUAL_COUNTS
+) -> Iterator[str]:
+    """Yield what a skew of the counters [s] means, if it is one, in words for people.
+
+    trigger: what is stated of them, and how close the stamps are at best
+    """
+    if skew is None:
+        return
+    skew += trigger.counter_offset * period
+    if abs(skew) > _SKEW_SAMPLES * period + trigger.stamp_tolerance:
         yield (
             f"at the same trigger number axes are stamped {skew / MILLISECOND_S:.4g} ms later than "
             f"the distance, {skew / period:.4g} samples: their counters were not started together, "

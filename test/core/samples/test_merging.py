@@ -11,9 +11,13 @@ from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import join_points, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.samples.merging import merged
+from omsm_ros.core.samples.merging import consecutive, joined
 
 PERIOD = 1e-3
+
+
+def merged(blocks):  # type: ignore[no-untyped-def]
+    return [joined(together) for together in consecutive(blocks)]
 
 
 def cut(z: np.ndarray, edges: list[int], jitter_ns: int = 0) -> list[AxisBlock]:

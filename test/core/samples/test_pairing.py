@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.samples.accounts import Reason, Tally
-from omsm_ros.core.samples.pairing import Pairing, Run
+from omsm_ros.core.samples.accounts import Reason
+from omsm_ros.core.samples.pairing import Intake, Pairing, Run
 
 
 def run(session: int, first: int, length: int, start_s: float | None = None, bad: int = 0) -> Run:
@@ -25,8 +25,9 @@ class Bench:
     """A pairing, its tallies and the pairs found so far."""
 
     def __init__(self) -> None:
-        self.axes, self.distance = Tally(), Tally()
-        self.pairing = Pairing(self.axes, self.distance)
+        axes, distance = Intake(), Intake()
+        self.axes, self.distance = axes.tally, distance.tally
+        self.pairing = Pairing(axes, distance)
         self.found: list[tuple[int, int, int]] = []
 
     def push(self, axes: list[Run], distance: list[Run]) -> Bench:

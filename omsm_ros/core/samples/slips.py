@@ -1,0 +1,203 @@
+"""Do equal trigger counts of two streams still mean the same trigger?
+
+A trigger that one device missed, or a counter that was started later, shifts one count against
+the other, and nothing but the stamps shows it. For equal counts the *skew* is the time of the
+axes less the time of the distance, a whole number of sample periods where the counts slipped.
+Its median over about a second is judged every tenth of one, against what the stamps allow:
+``|median| >= period / 2 + tolerance + 3 scatter`` is a slip, ``|median| < period / 2 + tolerance``
+ends it, and between the two the last verdict holds.
+
+Every decision rests on the stamps of blocks up to that count alone, so live and offline agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
+from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
+
+# Stamps of a driver are within 0.1 ms of the truth after 10 s (devices/clock.py); two drivers.
+TWO_DRIVERS_S = 0.2e-3
+# A driver's first stamps are as uneven as its first arrivals: of this time nothing is judged [s].
+_FIRST_S = 1.0
+# More than half of the span must have slipped: found 0.4 s to 0.6 s after it happened [s].
+_SPAN_S, _STRIDE_S = 0.8, 0.1
+# Stamps of either stream that a verdict needs; of long blocks they span more than a second.
+_LEAST_STAMPS = 8
+# Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
+_MOST_STAMPS = 4096
+# Scatter (standard deviation) of single stamps that the median of several never reaches.
+_SEVERAL_TIMES = 3.0
+_NORMAL_PER_MAD = 1.4826
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonTrigger:
+    """What is stated of the trigger that two devices count.
+
+    counter_offset: added to the distance's count, it gives the axes' count [samples]
+    stamp_tolerance: by how much their stamps of one trigger may differ, all the time [s]
+
+    Raises ConfigurationError for numbers that are neither.
+    """
+
+    counter_offset: int = 0
+    stamp_tolerance: float = TWO_DRIVERS_S
+
+    def __post_init__(self) -> None:
+        COUNTER_OFFSET.checked(self.counter_offset, ConfigurationError, "counter_offset")
+        STAMP_TOLERANCE.checked(self.stamp_tolerance, ConfigurationError, "stamp_tolerance")
+
+
+EQUAL_COUNTS = CommonTrigger()
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """What the stamps say of two counters.
+
+    samples: periods by which axes are stamped later at equal counts, 0 as long as they agree
+    seen_from: a slip of fewer samples cannot be told from the stamps' scatter; None = not judged
+    remedy: in words for people
+    """
+
+    samples: int = 0
+    seen_from: int | None = None
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return (
+            f"the trigger counter slipped by {self.samples} samples against that of the axes: "
+            f"{self.remedy}"
+        )
+
+
+class StampLine:
+    """Stamps of one stream's blocks, in the order of sessions and counts."""
+
+    def __init__(self) -> None:
+        self._coming: deque[tuple[int, int, int]] = deque()
+        self._current: tuple[int, int, int] | None = None
+
+    def add(self, session: int, count: int, stamp_ns: int) -> None:
+        """Append the newest block's session, first count and stamp."""
+        self._coming.append((session, count, stamp_ns))
+
+    def advance(self, session: int, count: int) -> bool:
+        """Go to the block of ``count``; return whether it begins there."""
+        while self._coming and self._coming[0][:2] <= (session, count):
+            self._current = self._coming.popleft()
+            if self._current[:2] == (session, count):
+                return True
+        return False
+
+    def next_in(self, session: int, end: int) -> int:
+        """Return where the next block begins, ``end`` if not before it."""
+        if self._coming and self._coming[0][0] == session:
+            return min(self._coming[0][1], end)
+        return end
+
+    def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
+        """Return the time of the sample ``count`` [ns], None where no block told it."""
+        if self._current is None or self._current[0] != session:
+            return None
+        return self._current[2] + (count - self._current[1]) * period_ns
+
+
+class SlipWatch:
+    """Judges pairs of two streams by the stamps of their blocks.
+
+    found: the last slip there was, healed or not; None if there was none
+    """
+
+    def __init__(self, axes: StampLine, distance: StampLine, trigger: CommonTrigger) -> None:
+        self._lines = (axes, distance)
+        self._trigger = trigger
+        self.found: Slip | None = None
+        self._restart((-1, -1), 0)
+
+    @property
+    def state(self) -> Slip:
+        """What the stamps said last."""
+        return self._state
+
+    def spans(
+        self, sessions: tuple[int, int], first: int, end: int, period_ns: float
+    ) -> Iterator[tuple[int, bool]]:
+        """Yield the end, and whether they slipped, of spans of pairs from ``first`` to ``end``."""
+        if sessions != self._sessions:
+            self._restart(sessions, first)
+        for line, session in zip(self._lines, sessions, strict=True):
+            line.advance(session, first - 1)
+        while (count := self._next(end)) < end:
+            before = self._state.samples
+            self._observe(count, period_ns)
+            if bool(self._state.samples) != bool(before) and count > first:
+                yield count, bool(before)
+        yield end, bool(self._state.samples)
+
+    def _restart(self, sessions: tuple[int, int], first: int) -> None:
+        self._sessions, self._start = sessions, first
+        self._state = Slip()
+        self._judged = -1
+        # Of each stamp: count, skew [ns], and whether it is of the axes, of the distance.
+        self._seen: deque[tuple[int, float, bool, bool]] = deque(maxlen=_MOST_STAMPS)
+
+    def _next(self, end: int) -> int:
+        pairs = zip(self._lines, self._sessions, strict=True)
+        return min(line.next_in(session, end) for line, session in pairs)
+
+    def _observe(self, count: int, period_ns: float) -> None:
+        """Take the skew where a block of either stream begins."""
+        (axes, distance), (a, d) = self._lines, self._sessions
+        of_axes, of_distance = axes.advance(a, count), distance.advance(d, count)
+        late, early = axes.stamp_of(a, count, period_ns), distance.stamp_of(d, count, period_ns)
+        per_s = NANOSECONDS_PER_S / period_ns
+        if late is None or early is None or count - self._start < _FIRST_S * per_s:
+            return
+        tenth = int(count // max(_STRIDE_S * per_s, 1.0))
+        if tenth != self._judged:
+            self._judged = tenth
+            self._judge(count - _SPAN_S * per_s, period_ns)
+        self._seen.append((count, late - early, of_axes, of_distance))
+
+    def _judge(self, since: float, period_ns: float) -> None:
+        seen = np.array(self._seen, np.float64).reshape(-1, 4)
+        starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
+        if min(map(len, starts)) < _LEAST_STAMPS:
+            return
+        oldest = min(
+            int(np.searchsorted(seen[:, 0], since)), *(int(s[-_LEAST_STAMPS]) for s in starts)
+        )
+        for _ in range(oldest):
+            self._seen.popleft()
+        skew = seen[oldest:, 1]
+        median = float(np.median(skew))
+        scatter = _NORMAL_PER_MAD * float(np.median(abs(skew - median)))
+        self._state = self._verdict(median / period_ns, scatter / period_ns, period_ns)
+        self.found = self._state if self._state.samples else self.found
+
+    def _verdict(self, skew: float, scatter: float, period_ns: float) -> Slip:
+        """Weigh median and scatter of the skew [samples]."""
+        steady = 0.5 + self._trigger.stamp_tolerance * NANOSECONDS_PER_S / period_ns
+        limit = steady + _SEVERAL_TIMES * scatter
+        slipped = abs(skew) >= (steady if self._state.samples else limit)
+        samples = (round(skew) or int(math.copysign(1, skew))) if slipped else 0
+        return Slip(samples, math.ceil(limit), self._remedy(skew, period_ns) if samples else "")
+
+    def _remedy(self, skew: float, period_ns: float) -> str:
+        later = skew * period_ns / NANOSECONDS_PER_S / MILLISECOND_S
+        return (
+            f"at equal counts axes are stamped {later:.4g} ms later, beyond what stamp_tolerance "
+            f"{self._trigger.stamp_tolerance / MILLISECOND_S:.4g} ms and the scatter allow; check "
+            "that both count the same trigger line and restart both drivers, or state "
+            f"counter_offset {self._trigger.counter_offset - round(skew)} if they are known to be "
+            "so far apart, or a stamp_tolerance that covers how late a link delivers"
+        )

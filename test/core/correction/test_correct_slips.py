@@ -1,0 +1,130 @@
+"""Samples of two counters that slipped are counted and give no points, live as offline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.samples.accounts import Account
+from omsm_ros.core.samples.blocks import Block
+from omsm_ros.core.samples.merging import consecutive
+from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.samples.slips import CommonTrigger
+from omsm_ros.errors import DataError
+from omsm_ros.nodes.correction_state import CorrectionState
+from omsm_ros.nodes.diagnostics import ERROR
+from omsm_ros.twin.cell import Recording
+
+from .corrected_runs import CALIBRATION, balanced, cut, part, same_points, shifted
+
+SLIP_AT, MISSED = 2000, 3
+
+
+@pytest.fixture(scope="module")
+def streams(scan: Recording) -> tuple[list[Block], list[Block]]:
+    """The probe missed triggers; stamps scatter by 20 us, so that joining blocks would hide it."""
+    random = np.random.default_rng(5)
+    axes = cut(part(scan.axes, 0, 5000), range(0, 5000, 50))
+    before = cut(part(scan.distance, 0, SLIP_AT), range(0, SLIP_AT, 40))
+    after = cut(part(scan.distance, SLIP_AT + MISSED, 5000), range(0, 5000, 40))
+    distance = [*before, *(shifted(block, -MISSED, 0.0) for block in after)]
+    scattered = [
+        [replace(b, stamp_ns=b.stamp_ns + int(random.integers(-20_000, 20_000))) for b in blocks]
+        for blocks in (axes, distance)
+    ]
+    return scattered[0], scattered[1]
+
+
+def corrected(
+    axes: list[Block], distance: list[Block], together: int, options: CorrectionOptions
+) -> tuple[SurfacePoints, Account, Corrector]:
+    """Correct; ``together`` blocks of each stream wait and are pushed at once; 0 = one by one."""
+    corrector, taken = Corrector(CALIBRATION, options), []
+    if not together:
+        for block in axes:
+            corrector.push_axes(block)  # type: ignore[arg-type]
+        for block in distance:
+            corrector.push_distance(block)  # type: ignore[arg-type]
+    for start in range(0, max(len(axes), len(distance)), together or 10**9) if together else ():
+        for blocks in consecutive(axes[start : start + together]):  # type: ignore[type-var]
+            corrector.push_axes(*blocks)
+        for blocks in consecutive(distance[start : start + together]):  # type: ignore[type-var]
+            corrector.push_distance(*blocks)
+        taken.append(corrector.take())
+        assert balanced(corrector.account.axes)
+        assert balanced(corrector.account.distance)
+    points = join_points([*taken, corrector.finish()])
+    return points, corrector.account, corrector
+
+
+def test_what_slipped_is_counted_and_gives_no_points(
+    streams: tuple[list[Block], list[Block]],
+) -> None:
+    points, account, corrector = corrected(*streams, 0, CorrectionOptions())
+    slipped = account.axes.counted["slipped"]
+    assert slipped == account.distance.counted["slipped"]
+    assert points.sample[-1] < SLIP_AT + 1000
+    assert slipped == 5000 - MISSED - 1 - points.sample[-1]
+    assert balanced(account.axes)
+    assert balanced(account.distance)
+    assert corrector.slips.state.samples == -MISSED
+
+
+@pytest.mark.parametrize("together", [1, 7, 30, 200])
+def test_live_and_offline_agree_to_the_last_bit(
+    streams: tuple[list[Block], list[Block]], together: int
+) -> None:
+    offline, expected, _ = corrected(*streams, 0, CorrectionOptions())
+    live, account, _ = corrected(*streams, together, CorrectionOptions())
+    assert account == expected
+    # Of blocks that waited together, a point is stamped by the first one.
+    assert same_points(replace(live, stamp_ns=0), replace(offline, stamp_ns=0))
+
+
+def test_diagnostics_say_what_slipped_and_what_to_do(
+    streams: tuple[list[Block], list[Block]],
+) -> None:
+    _, _, corrector = corrected(*streams, 0, CorrectionOptions())
+    report = CorrectionState().report(corrector, 0.0, 0.0)
+    assert report.level == ERROR
+    assert f"slipped by -{MISSED} samples" in report.message
+    assert "restart both drivers" in report.message
+    assert report.values["slip_samples"] == -MISSED
+    assert report.values["axes_slipped"] == report.values["distance_slipped"]
+
+
+def test_a_stated_offset_gives_the_same_surface(scan: Recording) -> None:
+    axes, distance = part(scan.axes, 0, 3000), part(scan.distance, 0, 3000)
+    plain, _, _ = corrected([axes], [distance], 0, CorrectionOptions())
+    for offset in (1, 20, 500):
+        stated = CorrectionOptions(trigger=CommonTrigger(counter_offset=offset))
+        late = shifted(part(distance, offset, 3000), -offset, 0.0)
+        points, account, _ = corrected([axes], [late], 0, stated)
+        assert account.axes.counted.get("slipped", 0) == 0
+        kept = plain.sample >= offset
+        same = np.isin(points.sample, plain.sample[kept])
+        assert np.all(same)
+        assert np.array_equal(points.height, plain.height[kept])
+
+
+def test_motion_whose_counters_slipped_is_refused(
+    streams: tuple[list[Block], list[Block]], scan: Recording
+) -> None:
+    axes, distance = streams
+    with pytest.raises(DataError, match=f"distance: .* slipped by -{MISSED} samples"):
+        assemble(axes, distance)  # type: ignore[arg-type]
+    whole = cut(part(scan.distance, 0, 5000), range(0, 5000, 40))
+    assert len(assemble(axes, whole)) == 5000  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="reference: .* slipped"):
+        assemble(axes, whole, distance)  # type: ignore[arg-type]
+    late = [shifted(block, -7, 0.0) for block in whole if block.first_sample >= 7]
+    with pytest.raises(DataError, match="slipped by -7 samples"):
+        assemble(axes, late)  # type: ignore[arg-type]
+    stated = CommonTrigger(counter_offset=7)
+    record = assemble(axes, late, trigger=stated)  # type: ignore[arg-type]
+    expected = assemble(axes, whole[1:])  # type: ignore[arg-type]
+    assert np.array_equal(record.distance, expected.distance, equal_nan=True)
