@@ -5,7 +5,8 @@ the other, and nothing but the stamps shows it. For equal counts the *skew* is t
 axes less the time of the distance, a whole number of sample periods where the counts slipped.
 Its median over about a second is judged every tenth of one, against what the stamps allow:
 ``|median| >= period / 2 + tolerance + 3 scatter`` is a slip, ``|median| < period / 2 + tolerance``
-ends it, and between the two the last verdict holds.
+ends it, and between the two the last verdict holds. The scatter is that within the second or that
+over the last half minute, whichever is larger: a driver's clock wanders while it learns.
 
 Every decision rests on the stamps of blocks up to that count alone, so live and offline agree.
 """
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
@@ -31,6 +33,8 @@ _FIRST_S = 1.0
 _SPAN_S, _STRIDE_S = 0.8, 0.1
 # Stamps of either stream that a verdict needs; of long blocks they span more than a second.
 _LEAST_STAMPS = 8
+# Over which the scatter is also taken: the window of a driver's clock [s].
+_WANDER_S = 30.0
 # Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
 _MOST_STAMPS = 4096
 # Scatter (standard deviation) of single stamps that the median of several never reaches.
@@ -149,6 +153,8 @@ class SlipWatch:
         self._judged = -1
         # Of each stamp: count, skew [ns], and whether it is of the axes, of the distance.
         self._seen: deque[tuple[int, float, bool, bool]] = deque(maxlen=_MOST_STAMPS)
+        # Skew at each stride of the last half minute without a slip [ns].
+        self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
     def _next(self, end: int) -> int:
         pairs = zip(self._lines, self._sessions, strict=True)
@@ -160,13 +166,18 @@ class SlipWatch:
         of_axes, of_distance = axes.advance(a, count), distance.advance(d, count)
         late, early = axes.stamp_of(a, count, period_ns), distance.stamp_of(d, count, period_ns)
         per_s = NANOSECONDS_PER_S / period_ns
-        if late is None or early is None or count - self._start < _FIRST_S * per_s:
+        if late is None or early is None:
             return
-        tenth = int(count // max(_STRIDE_S * per_s, 1.0))
-        if tenth != self._judged:
-            self._judged = tenth
-            self._judge(count - _SPAN_S * per_s, period_ns)
-        self._seen.append((count, late - early, of_axes, of_distance))
+        stride = int(count // max(_STRIDE_S * per_s, 1.0))
+        judged, self._judged = self._judged, stride
+        early_days = count - self._start < _FIRST_S * per_s
+        if stride != judged:
+            if not early_days:
+                self._judge(count - _SPAN_S * per_s, period_ns)
+            if not self._state.samples:
+                self._wander.append(late - early)
+        if not early_days:
+            self._seen.append((count, late - early, of_axes, of_distance))
 
     def _judge(self, since: float, period_ns: float) -> None:
         seen = np.array(self._seen, np.float64).reshape(-1, 4)
@@ -180,7 +191,7 @@ class SlipWatch:
             self._seen.popleft()
         skew = seen[oldest:, 1]
         median = float(np.median(skew))
-        scatter = _NORMAL_PER_MAD * float(np.median(abs(skew - median)))
+        scatter = max(_spread(skew), _spread(np.array(self._wander)))
         self._state = self._verdict(median / period_ns, scatter / period_ns, period_ns)
         self.found = self._state if self._state.samples else self.found
 
@@ -201,3 +212,8 @@ class SlipWatch:
             f"counter_offset {self._trigger.counter_offset - round(skew)} if they are known to be "
             "so far apart, or a stamp_tolerance that covers how late a link delivers"
         )
+
+
+def _spread(values: FloatArray) -> float:
+    """Return the standard deviation of normal values, little moved by others among them."""
+    return _NORMAL_PER_MAD * float(np.median(abs(values - np.median(values))))

@@ -91,8 +91,8 @@ def test_diagnostics_say_what_slipped_and_what_to_do(
     _, _, corrector = corrected(*streams, 0, CorrectionOptions())
     report = CorrectionState().report(corrector, 0.0, 0.0)
     assert report.level == ERROR
-    assert f"slipped by -{MISSED} samples" in report.message
-    assert "restart both drivers" in report.message
+    assert f"slipped by -{MISSED} samples" in report.text
+    assert "restart both drivers" in report.text
     assert report.values["slip_samples"] == -MISSED
     assert report.values["axes_slipped"] == report.values["distance_slipped"]
 
@@ -115,11 +115,11 @@ def test_motion_whose_counters_slipped_is_refused(
     streams: tuple[list[Block], list[Block]], scan: Recording
 ) -> None:
     axes, distance = streams
-    with pytest.raises(DataError, match=f"distance: .* slipped by -{MISSED} samples"):
+    with pytest.raises(DataError, match=rf"distance: .* slipped by -{MISSED} samples"):
         assemble(axes, distance)  # type: ignore[arg-type]
     whole = cut(part(scan.distance, 0, 5000), range(0, 5000, 40))
     assert len(assemble(axes, whole)) == 5000  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="reference: .* slipped"):
+    with pytest.raises(DataError, match=r"reference: .* slipped"):
         assemble(axes, whole, distance)  # type: ignore[arg-type]
     late = [shifted(block, -7, 0.0) for block in whole if block.first_sample >= 7]
     with pytest.raises(DataError, match="slipped by -7 samples"):
