@@ -164,7 +164,7 @@ _FLAGS = {
     "correct": [
         "--calibration", "--out", "--nominal", "--geometry", "--lateral-lag", "--sources",
         "--lateral", "--settings", "--by-stamps", "--delay", "--exposure", "--polarity",
-        "--override",
+        "--override", "--counter-offset", "--stamp-tolerance",
     ],
     "reversal": ["--calibration", "--out"],
     "align": ["--calibration", "--radius", "--geometry", "--out"],
