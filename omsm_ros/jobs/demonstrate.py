@@ -194,7 +194,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
-    judgement = Judgement(options, out=plan.out)
+    judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.freedoms)
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}

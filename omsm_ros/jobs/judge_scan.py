@@ -98,6 +98,7 @@ class Judgement:
             self.stated,
             accuracy=self.accuracy,
             pose_open=[name for name in counts if name not in fitted],
+            registered=bool(fitted),
             doubts=tuple(_losses(done)),
         )
 

@@ -97,6 +97,7 @@ def light_of(
     *,
     accuracy: float | None = None,
     pose_open: Sequence[str] = POSE,
+    registered: bool = False,
     doubts: Iterable[Reason] = (),
 ) -> Light:
     """Return the light of a scan.
@@ -105,6 +106,7 @@ def light_of(
     accuracy: asked for, k = 2 [m]; None takes the uncertainty that is stated
     pose_open: sources of the part's pose that count; none where it is not compared with a nominal
         surface, or is fitted to it
+    registered: whether others of the pose's freedoms are fitted to the nominal surface
     doubts: what else speaks against it
     """
     uncertainty = 2 * sum(size**2 for size in heights.values()) ** 0.5
@@ -113,7 +115,10 @@ def light_of(
     if verdict == REJECTED:
         found = [Reason("the calibration was rejected", "identify again"), *map(Reason, reasons)]
         return _light(RED, calibration, asked, uncertainty, found)
-    open_ = [*_latency(calibration, heights, accuracy), *_not_settled(stated, pose_open)]
+    open_ = [
+        *_latency(calibration, heights, accuracy),
+        *_not_settled(stated, pose_open, registered),
+    ]
     if not verdict:
         open_.insert(0, Reason("the calibration has no certificate", "identify again"))
     if uncertainty > asked:
@@ -155,12 +160,17 @@ def _latency(
         yield Reason(what, REMEDY)
 
 
-def _not_settled(stated: MachineSources, pose_open: Sequence[str]) -> Iterator[Reason]:
+def _not_settled(
+    stated: MachineSources, pose_open: Sequence[str], registered: bool
+) -> Iterator[Reason]:
     missing = [name for name in pose_open if not stated.of(name)]
     if missing:
         yield Reason(
             f"pose of the part not evaluated ({', '.join(missing)})",
-            "register the part to its nominal surface (--fit auto, or 'omsm form'), or state them",
+            "these are held; state them, or fit them too (--fit auto)"
+            if registered
+            else "register the part to its nominal surface (--fit auto, or 'omsm form'), or state "
+            "them",
         )
     for group, (names, remedy) in _GROUPS.items():
         if not any(stated.of(name) for name in names):

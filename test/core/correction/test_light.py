@@ -71,6 +71,16 @@ def test_pose_does_not_count_where_there_is_no_nominal_surface(settled: Calibrat
     assert light(settled, pose, pose_open=("clocking",)).level == AMBER
 
 
+def test_a_part_that_was_registered_is_not_to_be_registered_again(settled: Calibration) -> None:
+    pose = all_but("tilt", "decentre", "clocking")
+    (reason,) = light(settled, pose, pose_open=("decentre",), registered=True).reasons
+    assert "register the part" not in reason.remedy
+    assert "decentre" in reason.what
+    assert "--fit auto" in reason.remedy
+    (before,) = light(settled, pose, pose_open=("decentre",)).reasons
+    assert "register the part" in before.remedy
+
+
 def test_an_open_latency_is_settled_where_it_is_small_for_what_is_asked(
     true_calibration: Calibration,
 ) -> None:
