@@ -207,6 +207,28 @@ def test_predict_error_of_a_sine_is_that_of_its_frequency(cell, true_calibration
     assert answer.outside_band_fraction == pytest.approx(share, rel=0.02)
 
 
+def test_a_slip_of_the_counters_is_an_error_and_ends_the_points(cell, true_calibration):
+    """The probe misses two triggers: its count is behind from then on, its stamps are not."""
+    cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
+    feed, length = Feed(cell), 100
+    for number in range(40):
+        common = {"sample_period": PERIOD, "first_sample": number * length}
+        stamp = number * length * 1_000_000
+        zero = np.zeros(length)
+        missed = 2 if number >= 20 else 0
+        feed.send(
+            AxisBlock(**common, stamp_ns=stamp, z=zero, **dict.fromkeys("xybc", zero)),
+            DistanceBlock(**common, stamp_ns=stamp + missed * 1_000_000, distance=zero),
+        )
+    cell.wait(
+        "all samples in the account",
+        lambda: cell.operator.value("corrector", "distance_received") == 40 * length,
+    )
+    cell.wait("the slip", lambda: cell.operator.value("corrector", "slip_samples") == -2)
+    assert cell.operator.value("corrector", "distance_slipped") >= 1000
+    cell.processes.check()
+
+
 def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     """Bit for bit, whatever was between: messages, DDS, blocks."""
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector

@@ -40,6 +40,9 @@ _MOST_STAMPS = 4096
 # Scatter (standard deviation) of single stamps that the median of several never reaches.
 _SEVERAL_TIMES = 3.0
 _NORMAL_PER_MAD = 1.4826
+# Stamps that advance faster or slower than the counts by this factor are of a time lapse, or none:
+# a second of theirs is not one of the samples. A slip of a third of the span is still judged.
+_TIME_LAPSE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +154,8 @@ class SlipWatch:
         self._sessions, self._start = sessions, first
         self._state = Slip()
         self._judged = -1
-        # Of each stamp: count, skew [ns], and whether it is of the axes, of the distance.
-        self._seen: deque[tuple[int, float, bool, bool]] = deque(maxlen=_MOST_STAMPS)
+        # Of each stamp: count, skew [ns], whether it is of the axes, of the distance, axes' time.
+        self._seen: deque[tuple[int, float, bool, bool, float]] = deque(maxlen=_MOST_STAMPS)
         # Skew at each stride of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
@@ -177,10 +180,10 @@ class SlipWatch:
             if not self._state.samples:
                 self._wander.append(late - early)
         if not early_days:
-            self._seen.append((count, late - early, of_axes, of_distance))
+            self._seen.append((count, late - early, of_axes, of_distance, late))
 
     def _judge(self, since: float, period_ns: float) -> None:
-        seen = np.array(self._seen, np.float64).reshape(-1, 4)
+        seen = np.array(self._seen, np.float64).reshape(-1, 5)
         starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
         if min(map(len, starts)) < _LEAST_STAMPS:
             return
@@ -189,7 +192,11 @@ class SlipWatch:
         )
         for _ in range(oldest):
             self._seen.popleft()
-        skew = seen[oldest:, 1]
+        seen = seen[oldest:]
+        if not _in_real_time(seen[:, 0] * period_ns, seen[:, 4]):
+            self._state = Slip()
+            return
+        skew = seen[:, 1]
         median = float(np.median(skew))
         scatter = max(_spread(skew), _spread(np.array(self._wander)))
         self._state = self._verdict(median / period_ns, scatter / period_ns, period_ns)
@@ -212,6 +219,13 @@ class SlipWatch:
             f"counter_offset {self._trigger.counter_offset - round(skew)} if they are known to be "
             "so far apart, or a stamp_tolerance that covers how late a link delivers"
         )
+
+
+def _in_real_time(counted: FloatArray, stamped: FloatArray) -> bool:
+    """Return whether stamps [ns] advance about as the counts do [ns]."""
+    elapsed = float(counted[-1] - counted[0])
+    passed = float(stamped[-1] - stamped[0])
+    return elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed
 
 
 def _spread(values: FloatArray) -> float:
