@@ -13,7 +13,7 @@ from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.files import save_text
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
 STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
 
@@ -35,7 +35,7 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
     Raises BagError where a bag of that name is there already.
     """
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
-    steps = _write(out / STEPS, step_test_of(scenario, wrong))
+    steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
     write_nominal(out / NOMINAL)
     return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)

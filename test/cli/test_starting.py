@@ -9,7 +9,8 @@ def test_omsm_alone_tells_what_to_do_next(capsys):
     assert cli.main([]) == 0
     told = capsys.readouterr().out
     words = [line.split("omsm ")[1].split()[0] for line in told.splitlines() if "  omsm " in line]
-    assert words == ["doctor", "demo", "twin", "plan", "inspect", "identify", "predict", "correct"]
+    first = ["doctor", "demo", "twin", "plan", "inspect", "identify", "predict", "correct", "form"]
+    assert words == first
 
 
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
@@ -41,3 +42,17 @@ def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
     assert summary["deviation"]["corrected"]["rms_area_weighted"] < 40e-9
     assert cli.main(command) == 2
     assert "exists" in capsys.readouterr().err
+
+
+def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
+    """Its step test is the one that is planned for a machine: what it could not show is small."""
+    assert cli.main(["twin", "--out", str(tmp_path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    calibration = str(tmp_path / "cal.json")
+    assert cli.main(["identify", facts["steps"], "--out", calibration]) == 0
+    capsys.readouterr()
+    assert cli.main(["predict", facts["scan"], "--calibration", calibration, "--json"]) == 0
+    prediction = json.loads(capsys.readouterr().out)
+    assert prediction["safe"]
+    # The paper's twenty steps leave 1.0 nm, for they hide a slow relaxation.
+    assert prediction["residual"] < 0.7e-9
