@@ -36,7 +36,7 @@ _LEAST_STAMPS = 8
 # Over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
 # Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
-_MOST_STAMPS = 4096
+_MOST_STAMPS = 1024
 # Scatter (standard deviation) of single stamps that the median of several never reaches.
 _SEVERAL_TIMES = 3.0
 _NORMAL_PER_MAD = 1.4826
@@ -133,7 +133,10 @@ class SlipWatch:
     @property
     def state(self) -> Slip:
         """What the stamps said last."""
-        return self._state
+        if self._state.samples:
+            return self._state
+        window = self._window()
+        return Slip() if window is None else Slip(seen_from=math.ceil(self._limit(window)))
 
     def spans(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
@@ -153,7 +156,9 @@ class SlipWatch:
     def _restart(self, sessions: tuple[int, int], first: int) -> None:
         self._sessions, self._start = sessions, first
         self._state = Slip()
-        self._judged = -1
+        self._judged, self._since, self._period_ns = -1, 0.0, 1.0
+        # Whether any stamp since the last verdict is off enough: without one no median is.
+        self._odd = False
         # Of each stamp: count, skew [ns], whether it is of the axes, of the distance, axes' time.
         self._seen: deque[tuple[int, float, bool, bool, float]] = deque(maxlen=_MOST_STAMPS)
         # Skew at each stride of the last half minute without a slip [ns].
@@ -176,39 +181,51 @@ class SlipWatch:
         early_days = count - self._start < _FIRST_S * per_s
         if stride != judged:
             if not early_days:
-                self._judge(count - _SPAN_S * per_s, period_ns)
+                self._since, self._period_ns = count - _SPAN_S * per_s, period_ns
+                self._judge()
             if not self._state.samples:
                 self._wander.append(late - early)
         if not early_days:
             self._seen.append((count, late - early, of_axes, of_distance, late))
+            self._odd |= abs(late - early) >= self._steady(period_ns) * period_ns
 
-    def _judge(self, since: float, period_ns: float) -> None:
+    def _judge(self) -> None:
+        if not (self._odd or self._state.samples):
+            return
+        window = self._window()
+        self._state = Slip() if window is None else self._verdict(window)
+        self._odd = window is None or bool(np.any(abs(window) >= self._steady(self._period_ns)))
+        self.found = self._state if self._state.samples else self.found
+
+    def _window(self) -> FloatArray | None:
+        """Return the skews to be judged [samples], None if they tell nothing."""
         seen = np.array(self._seen, np.float64).reshape(-1, 5)
         starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
         if min(map(len, starts)) < _LEAST_STAMPS:
-            return
-        oldest = min(
-            int(np.searchsorted(seen[:, 0], since)), *(int(s[-_LEAST_STAMPS]) for s in starts)
-        )
-        for _ in range(oldest):
-            self._seen.popleft()
+            return None
+        since = int(np.searchsorted(seen[:, 0], self._since))
+        oldest = min(since, *(int(s[-_LEAST_STAMPS]) for s in starts))
         seen = seen[oldest:]
-        if not _in_real_time(seen[:, 0] * period_ns, seen[:, 4]):
-            self._state = Slip()
-            return
-        skew = seen[:, 1]
-        median = _median(skew)
-        scatter = max(_spread(skew), _spread(np.array(self._wander)))
-        self._state = self._verdict(median / period_ns, scatter / period_ns, period_ns)
-        self.found = self._state if self._state.samples else self.found
+        if not _in_real_time(seen[:, 0] * self._period_ns, seen[:, 4]):
+            return None
+        return np.asarray(seen[:, 1] / self._period_ns)
 
-    def _verdict(self, skew: float, scatter: float, period_ns: float) -> Slip:
-        """Weigh median and scatter of the skew [samples]."""
-        steady = 0.5 + self._trigger.stamp_tolerance * NANOSECONDS_PER_S / period_ns
-        limit = steady + _SEVERAL_TIMES * scatter
-        slipped = abs(skew) >= (steady if self._state.samples else limit)
-        samples = (round(skew) or int(math.copysign(1, skew))) if slipped else 0
-        return Slip(samples, math.ceil(limit), self._remedy(skew, period_ns) if samples else "")
+    def _steady(self, period_ns: float) -> float:
+        """Return the skew of stamps without scatter that is a slip [samples]."""
+        return 0.5 + self._trigger.stamp_tolerance * NANOSECONDS_PER_S / period_ns
+
+    def _limit(self, window: FloatArray) -> float:
+        """Return the skew that is a slip [samples]."""
+        scatter = max(_spread(window), _spread(np.array(self._wander) / self._period_ns))
+        return self._steady(self._period_ns) + _SEVERAL_TIMES * scatter
+
+    def _verdict(self, window: FloatArray) -> Slip:
+        skew, limit = _median(window), self._limit(window)
+        slipped = abs(skew) >= (self._steady(self._period_ns) if self._state.samples else limit)
+        if not slipped:
+            return Slip()
+        samples = round(skew) or int(math.copysign(1, skew))
+        return Slip(samples, math.ceil(limit), self._remedy(skew, self._period_ns))
 
     def _remedy(self, skew: float, period_ns: float) -> str:
         later = skew * period_ns / NANOSECONDS_PER_S / MILLISECOND_S
