@@ -68,6 +68,9 @@ def plc():
     yield made
     made.server.stop()
     made.server.join(timeout=5.0)
+    made.server.server.close()
+    for client in made.server.clients:
+        client.client.close()
 
 
 @pytest.fixture

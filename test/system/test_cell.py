@@ -29,7 +29,9 @@ def account(cell, stream):
     return counts
 
 
-@pytest.mark.parametrize("device", ["six_channel", "chrocodile"])
+@pytest.mark.parametrize(
+    "device", ["six_channel", pytest.param("chrocodile", marks=pytest.mark.soak)]
+)
 def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(
         cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=1e-3, device=device
@@ -91,7 +93,8 @@ def start_scan_of_new_emulator(cell):
 
 
 def test_killed_and_restarted_emulator(cell, true_calibration):
-    start_correcting(cell, true_calibration)
+    # Slow enough that the scan outlasts the kill on a busy computer.
+    start_correcting(cell, true_calibration, time_lapse=3.0)
     assert cell.call(Trigger, "cell_emulator/scan").success
     cell.wait("half a scan", lambda: cell.operator.value("corrector", "axes_received") > 5000)
     cell.processes.end("cell_emulator", how=signal.SIGKILL)

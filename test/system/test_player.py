@@ -122,7 +122,8 @@ def test_at_rate_0_nothing_is_lost_by_who_stops_for_a_while(
     stopped = cell.processes._running["corrector"]
     stopped.send_signal(signal.SIGSTOP)
     assert cell.call(Trigger, "player/resume").success
-    assert 0 < cell.settle("player", "axes") <= 201  # no more than a part of its queue
+    cell.wait("the player to say what it published", lambda: value("player", "axes") > 0)
+    assert cell.settle("player", "axes") <= 201  # no more than a part of its queue
     stopped.send_signal(signal.SIGCONT)
     assert played(cell) == 0
     cell.processes.end("recorder")
@@ -160,7 +161,11 @@ def test_recorded_points_go_elsewhere_and_only_if_asked_for(cell, small_scan_blo
             bag.write(bags.POINTS_TOPIC, axes.stamp_ns, cloud)
     live, elsewhere = cell.clouds(), hear(cell, PointCloud2, "/omsm/recorded/points")
     axes, clock = hear(cell, AxisBlock, "/omsm/axes"), hear(cell, Clock, "/clock")
-    play(cell, path, rate=20.0, start=0.95, duration=1.0, clock=True)
+    play(cell, path, rate=20.0, start=0.95, duration=1.0, clock=True, paused=True)
+    # The player waits for who takes samples, not for who looks at the clock.
+    cell.wait("who tells the time", lambda: cell.operator.count_publishers("/clock") > 0)
+    first_step(cell)
+    assert cell.call(Trigger, "player/resume").success
     assert played(cell) == 0
     assert (len(live), len(elsewhere)) == (0, 0)
     assert [a.first_sample for a in axes] == [p[0].first_sample for p in pairs[10:20]]

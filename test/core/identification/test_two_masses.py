@@ -92,6 +92,7 @@ def test_masses_do_not_explain_a_latency():
     assert found.certificate["two_mass"] is None
 
 
+@pytest.mark.soak  # many fits
 def test_stated_uncertainty_and_misfit_are_those_of_repeated_fits():
     found = calibrated(False, 10.0)
     lines = np.linspace(found.valid_up_to / 40, found.valid_up_to, 40)

@@ -33,7 +33,7 @@ class TestPage:
             calibration.id, "omsm-calibration/1", "0.1.0", *entries["warnings"],
             "Low-frequency delay", "Static gain", "χ²", "Noise of one reading", "k = 1",
             "Tests of the residual", "whiteness, p", "Candidates", "lowest BIC", "✓ chosen",
-            "Modes", "Coefficients", "Shape of the response", "backlash", "none seen",
+            "Modes", "Coefficients", "Shape of the response", "backlash", "none found",
             "falls when Z rises", "compared", "10 442", "1.000 ms", "500.0 Hz",
         ):  # fmt: skip
             assert text in page.text, text
@@ -153,7 +153,10 @@ class TestVerdict:
 
     @pytest.mark.parametrize(
         ("valid", "shown", "why"),
-        [(60.0, 80.0, "the band leaves its limits"), (60.0, 60.0, "the motion tells too little")],
+        [
+            (60.0, 80.0, "the band exceeds its limits"),
+            (60.0, 60.0, "the motion excites too little"),
+        ],
     )
     def test_accepted_says_why_no_further(self, calibration, valid, shown, why):
         short = replace(certified(calibration, shown_up_to_hz=shown), valid_up_to=valid)
