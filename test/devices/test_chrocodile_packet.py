@@ -87,6 +87,7 @@ def test_it_is_back_within_five_seconds(cell: Any, fault: str) -> None:
     )
 
 
+@pytest.mark.soak
 @settings(
     max_examples=20,
     deadline=None,

@@ -88,6 +88,7 @@ def interferometer(results, path, spread=None):
     return path
 
 
+@pytest.mark.soak
 def test_a_map_of_another_instrument(results, tmp_path, capsys):
     path = interferometer(results, tmp_path / "zygo.xyz")
     status, said = difference(capsys, tmp_path / "d", results["slow"], path)

@@ -63,6 +63,7 @@ def again(cell, node, start):
     start()
 
 
+@pytest.mark.soak
 def test_through_restarts_in_any_order(cell, two):
     first, second = two
     start_calibrator(cell)

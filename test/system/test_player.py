@@ -95,6 +95,7 @@ def live_cloud(cell, path, calibration_file, **parameters):
     return np.concatenate([conversions.cloud_array(cloud) for cloud in clouds])
 
 
+@pytest.mark.soak
 def test_at_any_rate_and_offline_the_clouds_are_equal(cell, small_scan_blocks, true_calibration):
     pairs = small_scan_blocks[:BLOCKS]
     path = record(cell.folder / "scan.mcap", pairs)

@@ -81,6 +81,7 @@ def test_stated_uncertainties_hold_over_repetitions():
     assert 0.2 < np.mean(probabilities) < 0.8
 
 
+@pytest.mark.soak
 def test_form_like_errors_scatter_as_stated():
     """An error with the stated size and correlation length, drawn anew each time."""
     length, size, scores = 2.5e-3, 5e-9, []

@@ -59,6 +59,7 @@ def overshooting(seed, half_gap):
     return MotionRecord.from_arrays(PERIOD, encoder, -seen + rng.normal(0, 10e-9, len(seen)))
 
 
+@pytest.mark.soak
 def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
     found = identify(overshooting(3, HALF_GAP_M)).calibration
     (departure,) = found.certificate["departures"]

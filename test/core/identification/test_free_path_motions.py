@@ -28,6 +28,7 @@ def identified(motion, plant, part, seed):
     ).calibration
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("motion", "plant", "part", "reaches"),
     [

@@ -82,6 +82,7 @@ def test_the_pole_pair_of_eq_12_at_10_khz():
     assert abs(off(found, EQ_12, 0)[0]) < 4
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("truth", "order"),
     [
@@ -111,6 +112,7 @@ def test_an_order_asked_for_that_leaves_things_open_says_so():
     assert not any("asked" in w for w in identified(EQ_12, 1).certificate["warnings"])
 
 
+@pytest.mark.soak
 def test_masses_and_springs_scatter_as_stated():
     """The whole chain, from the recording; m1 is the unit."""
     over = []

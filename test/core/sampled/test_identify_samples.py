@@ -80,6 +80,7 @@ def test_units_do_not_matter():
     )
 
 
+@pytest.mark.soak
 def test_an_order_asked_for_is_known_no_better_than_the_free_choice_leaves_open():
     record = recorded("zero-order", noise=0.02)
     free, low = (identify_samples(*record, PERIOD, order=order) for order in (0, 1))
