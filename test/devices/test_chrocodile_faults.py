@@ -47,6 +47,7 @@ FAULTS = st.one_of(
 
 @pytest.mark.parametrize("form", ["binary", "ascii"])
 @settings(
+    derandomize=True,
     max_examples=25,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
