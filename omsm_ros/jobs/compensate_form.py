@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.form.compensation import compensation
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.placement import Aperture
@@ -33,15 +32,7 @@ def compensate_form(
 
     Raises DataError as ``omsm form`` does, and for a wavelength that is finer than the points tell.
     """
-    form = analyse_form(
-        surface,
-        measured.portions,
-        asked,
-        sources=measured.sources,
-        bounds=measured.bounds,
-        aperture=aperture,
-        even=measured.even,
-    )
+    form = measured.form(surface, asked, aperture)
     found = compensation(form.map, surface, low_pass)
     x, y = np.meshgrid(found.x, found.y)
     known = np.isfinite(found.offset)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.form.analyse import Form
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.placement import FREEDOMS, Aperture
 from omsm_ros.jobs.measured_portions import Measurement
@@ -37,16 +37,7 @@ def judge_form(
 
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
-    form = analyse_form(
-        surface,
-        measured.portions,
-        asked,
-        sources=measured.sources,
-        bounds=measured.bounds,
-        aperture=aperture,
-        even=measured.even,
-        filters=filters,
-    )
+    form = measured.form(surface, asked, aperture, filters)
     facts = form_facts(form, measured)
     save_json(out / FORM, facts)
     save_json(out / CURVES, _curves(form))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.height_grid import as_grid
-from omsm_ros.core.surface.placement import Portion, Portions
+from omsm_ros.core.surface.placement import Aperture, Portion, Portions
 from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.fields_file import load_fields
@@ -37,6 +39,25 @@ class Measurement:
     notes: tuple[str, ...] = ()
     even: bool = False
     bounds: tuple[str, ...] = ()
+
+    def form(
+        self,
+        surface: Surface,
+        asked: Sequence[str],
+        aperture: Aperture | None = None,
+        filters: tuple[float | None, float | None] = (None, None),
+    ) -> Form:
+        """Return the form against ``surface``, with all that is known of the points."""
+        return analyse_form(
+            surface,
+            self.portions,
+            asked,
+            sources=self.sources,
+            bounds=self.bounds,
+            aperture=aperture,
+            even=self.even,
+            filters=filters,
+        )
 
 
 def open_measurement(path: Path, units: LengthUnits | None = None) -> Measurement:
