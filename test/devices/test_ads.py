@@ -16,6 +16,8 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 pytest.importorskip("pyads", reason="pyads is an optional package")
 from pyads.testserver import AdsTestServer, AdvancedHandler, PLCVariable
 
+# The port of ADS is fixed: one server at a time.
+pytestmark = pytest.mark.xdist_group("ads")
 SAMPLES = 50
 ADDRESS = f"ads://127.0.0.1?samples={SAMPLES}"
 
@@ -61,10 +63,11 @@ class Plc:
 
 @pytest.fixture
 def plc():
-    try:
-        made = Plc()
-    except OSError as err:  # the port of ADS is fixed
+    try:  # bound here first, for their server forgets its socket if it cannot bind it
+        socket.create_server(("127.0.0.1", 48898)).close()
+    except OSError as err:
         pytest.skip(f"port 48898 is in use: {err}")
+    made = Plc()
     yield made
     made.server.stop()
     made.server.join(timeout=5.0)
