@@ -54,6 +54,25 @@ class Cell:
         given = {"port": self.link} | emulated("six_channel").driver
         self.processes.start("confocal_driver", **(given | parameters))
 
+    def start_correcting(self, calibration, **emulator):
+        """Emulator, driver and corrector, all connected."""
+        from omsm_ros.storage.calibration_file import save_calibration
+
+        path = self.folder / "cal.json"
+        save_calibration(path, calibration)
+        self.start_emulator(**emulator)
+        self.start_driver()
+        self.processes.start("corrector", calibration=str(path))
+        value = self.operator.value
+        self.wait(
+            "the nodes",
+            lambda: (
+                value("confocal_driver", "axes_subscribers") >= 1
+                and value("confocal_driver", "confocal_subscribers") >= 1
+                and value("confocal_driver", "connections") >= 1
+            ),
+        )
+
     def call(self, kind, name, **fields):
         return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
 

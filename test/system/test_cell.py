@@ -57,23 +57,6 @@ def test_calibrate_scan_correct_and_replay(cell, device):
     assert page.count("data:image/png;base64,") >= 8
 
 
-def start_correcting(cell, calibration, **emulator):
-    """Emulator, driver and corrector, all connected."""
-    path = cell.folder / "cal.json"
-    save_calibration(path, calibration)
-    cell.start_emulator(**emulator)
-    cell.start_driver()
-    cell.processes.start("corrector", calibration=str(path))
-    cell.wait(
-        "the nodes",
-        lambda: (
-            cell.operator.value("confocal_driver", "axes_subscribers") >= 1
-            and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
-            and cell.operator.value("confocal_driver", "connections") >= 1
-        ),
-    )
-
-
 def reconnected(cell):
     cell.wait("the port again", lambda: cell.operator.value("confocal_driver", "connections") >= 2)
 
@@ -94,7 +77,7 @@ def start_scan_of_new_emulator(cell):
 
 def test_killed_and_restarted_emulator(cell, true_calibration):
     # Slow enough that the scan outlasts the kill on a busy computer.
-    start_correcting(cell, true_calibration, time_lapse=3.0)
+    cell.start_correcting(true_calibration, time_lapse=3.0)
     assert cell.call(Trigger, "cell_emulator/scan").success
     cell.wait("half a scan", lambda: cell.operator.value("corrector", "axes_received") > 5000)
     cell.processes.end("cell_emulator", how=signal.SIGKILL)
@@ -124,7 +107,7 @@ def test_killed_and_restarted_emulator(cell, true_calibration):
 
 
 def test_noise_on_the_wire(cell, true_calibration):
-    start_correcting(cell, true_calibration, fault_noise=0.01, fault_flip=0.01, fault_drop=0.01)
+    cell.start_correcting(true_calibration, fault_noise=0.01, fault_flip=0.01, fault_drop=0.01)
     assert cell.call(Trigger, "cell_emulator/scan").success
     cell.wait(
         "the noisy scan", lambda: cell.operator.value("cell_emulator", "samples_played") >= 20_000

@@ -19,19 +19,7 @@ LAPSE = 2.0  # ten seconds: longer than a node needs to start again
 
 
 def start_scanning(cell, calibration):
-    path = cell.folder / "cal.json"
-    save_calibration(path, calibration)
-    cell.start_emulator(time_lapse=LAPSE)
-    cell.start_driver()
-    cell.processes.start("corrector", calibration=str(path))
-    cell.wait(
-        "the nodes",
-        lambda: (
-            cell.operator.value("confocal_driver", "axes_subscribers") >= 1
-            and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
-            and cell.operator.value("confocal_driver", "connections") >= 1
-        ),
-    )
+    cell.start_correcting(calibration, time_lapse=LAPSE)
     assert cell.call(Trigger, "cell_emulator/scan").success
 
 
