@@ -25,8 +25,9 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
-# Two processes, the nodes in one of them (see test/conftest.py); JOBS=0 for one after the other.
-JOBS ?= 2
+# Three processes, the nodes in one of them, which mostly waits (see test/conftest.py); JOBS=0 for
+# one after the other.
+JOBS ?= 3
 test: lint
 	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadgroup
 

@@ -136,7 +136,7 @@ def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibrat
 def changed_copy(folder, path, *changes):
     """The package with some text of one file replaced; returns how to run Python with it."""
     copy = folder / "omsm_ros"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, copy)
     shutil.copytree(PACKAGE.parent / "msg_defs", folder / "msg_defs")
     text = (copy / path).read_text(encoding="utf-8")
     for old, new in changes:

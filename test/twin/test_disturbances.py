@@ -26,6 +26,7 @@ QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0)
 MIDDLE = -49e-6
 FLAT = Flat()
 SMALL = Spiral(PAPER_MIRROR, start_radius=1e-3, feed_per_turn=5e-4, spindle_speed=30.0)
+ONE_TURN = Spiral(PAPER_MIRROR, start_radius=1e-3, feed_per_turn=1e-3, spindle_speed=60.0)
 
 
 def quiet(disturbances, motion, surface=FLAT, **kwargs):
@@ -53,8 +54,8 @@ def test_the_catalogue_rises_in_size_and_halving_the_step_changes_nothing(name):
     off_the_grid = CATALOGUE[name][-1]
     if name != "trigger jitter":
         off_the_grid = together(off_the_grid, CATALOGUE["trigger jitter"][-1])
-    short = StepTest(count=2)
-    for motion, surface, where in ((short, FLAT, MIDDLE), (SMALL, PAPER_MIRROR, 0.0)):
+    short = StepTest(count=1, dwell=0.3)
+    for motion, surface, where in ((short, FLAT, -4.9e-6), (ONE_TURN, PAPER_MIRROR, 0.0)):
         coarse, fine = (
             quiet(off_the_grid, motion, surface, stand_off=where, substeps=n) for n in (16, 32)
         )
@@ -296,7 +297,7 @@ def everything():
 @pytest.mark.parametrize("period", [1e-2, 1e-3, 1e-4])
 def test_at_any_rate_half_the_step_changes_nothing_with_everything_at_once(period):
     cell = Cell(probe=QUIET, encoder_noise=0.0, sample_period=period, disturbances=everything())
-    motion = StepTest(count=1)
+    motion = StepTest(count=1, dwell=max(0.1, 50 * period))
     steps = max(16, round(period / 62.5e-6))
     default, finer = (
         record(cell, motion, FLAT, stand_off=-4.9e-6, substeps=n) for n in (None, 2 * steps)
