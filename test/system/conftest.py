@@ -106,6 +106,20 @@ class Cell:
                 last, since = now, time.monotonic()
         return last
 
+    def closed_account(self, stream):
+        """Samples that the corrector received of ``stream``, each of which it has counted."""
+        status, prefix = self.operator._status["corrector"], f"{stream}_"
+        counts = {
+            key.removeprefix(prefix): int(value)
+            for key, value in status.items()
+            if key.startswith(prefix)
+        }
+        uncalibrated, refused = counts.pop("uncalibrated"), counts.pop("refused")
+        received = counts.pop("received")
+        assert uncalibrated == refused == 0
+        assert sum(counts.values()) == received
+        return received
+
 
 @pytest.fixture
 def cell(tmp_path):

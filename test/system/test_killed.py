@@ -34,21 +34,6 @@ def kill_at(cell, node, samples, restart):
     cell.wait(f"the new {node}", lambda: cell.operator.text(node, "lifecycle") == "active")
 
 
-def account_is_closed(cell, stream):
-    status = cell.operator._status["corrector"]
-    prefix = f"{stream}_"
-    counts = {
-        key.removeprefix(prefix): int(value)
-        for key, value in status.items()
-        if key.startswith(prefix)
-    }
-    uncalibrated, refused = counts.pop("uncalibrated"), counts.pop("refused")
-    received = counts.pop("received")
-    assert uncalibrated == refused == 0
-    assert sum(counts.values()) == received
-    return received
-
-
 def seeds(many):
     """One for each run of the tests, more in the soak."""
     return [0, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, many))]
@@ -63,7 +48,7 @@ def test_a_killed_driver_leaves_a_gap_that_is_counted(cell, true_calibration, se
     cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= SCAN)
     for stream in ("axes", "distance"):
         cell.settle("corrector", f"{stream}_received")
-        received = account_is_closed(cell, stream)
+        received = cell.closed_account(stream)
         missing = cell.operator.value("corrector", f"missing_{stream}")
         assert missing > 0
         assert received + missing == SCAN
@@ -79,7 +64,7 @@ def test_a_killed_corrector_goes_on_where_it_comes_back(cell, true_calibration, 
     kill_at(cell, "corrector", when, lambda: cell.processes.start("corrector", calibration=path))
     cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= SCAN)
     cell.settle("corrector", "axes_received")
-    received = {stream: account_is_closed(cell, stream) for stream in ("axes", "distance")}
+    received = {stream: cell.closed_account(stream) for stream in ("axes", "distance")}
     assert min(received.values()) > 0
     # From its first sample on none is missing; two streams are found a moment apart.
     assert cell.operator.value("corrector", "missing_axes") == 0
@@ -117,7 +102,7 @@ def test_blocks_of_one_sample_are_all_in_the_account(cell, true_calibration, cou
     single_samples(cell, count)
     for stream in ("axes", "distance"):
         cell.settle("corrector", f"{stream}_received")
-        received = account_is_closed(cell, stream)
+        received = cell.closed_account(stream)
         assert received + cell.operator.value("corrector", f"missing_{stream}") == count
 
 
@@ -163,4 +148,4 @@ def test_a_prediction_does_not_stop_the_samples(cell, true_calibration, small_sc
     sent = sum(len(pair[0]) for pair in small_scan_blocks[:100])
     cell.wait("all samples", lambda: cell.operator.value("corrector", "distance_received") == sent)
     cell.wait("all answers", lambda: all(future.done() for future in futures))
-    assert account_is_closed(cell, "axes") == sent
+    assert cell.closed_account("axes") == sent
