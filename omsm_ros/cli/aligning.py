@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import add_bags, cell_of, number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
 from omsm_ros.jobs.study_scans import alignment_of
@@ -22,7 +22,7 @@ _NOT_NOISE = 3.0
 
 
 def _declare_align(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path, help="a scan of a reference sphere")
+    add_bags(sub, "bag", help="a scan of a reference sphere")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument(
         "--radius", type=number(quantities.RADIUS), required=True, help="[m], negative if convex"
@@ -35,7 +35,8 @@ def _align(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     known = geometry_of(args.geometry)
     with progress_bar("correcting", args.json) as progress:
-        found, account = alignment_of(args.bag, calibration, args.radius, known, progress)
+        scan = cell_of(args.bag, args)
+        found, account = alignment_of(scan, calibration, args.radius, known, progress)
     save_geometry(args.out, found.geometry)
     names = ("centre_x", "centre_y", "beam_x", "beam_y")
     # JSON has no infinity: a lean that the scan cannot show has no uncertainty to state.

@@ -56,8 +56,13 @@ def json_object(text: str) -> dict[str, object]:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 
-def add_cell(sub: argparse.ArgumentParser) -> None:
-    """Add the options that say which topics of a bag are the cell's."""
+def add_bags(sub: argparse.ArgumentParser, *names: str, **described: Any) -> None:
+    """Add arguments that name bags, and the options that say which of their topics are the cell's.
+
+    described: of each, as for ``add_argument``; what they name is told by :func:`cell_of`
+    """
+    for name in names:
+        sub.add_argument(name, type=Path, **described)
     sub.add_argument(
         "--namespace", default="", metavar="/CELL", help="of the cell, in a bag of several"
     )
@@ -79,8 +84,20 @@ def _topics(text: str) -> dict[str, str]:
 
 
 def cell_of(path: Path, args: argparse.Namespace) -> AnyBag:
-    """Return the bag at ``path``, with the cell that was asked for of :func:`add_cell`."""
-    return CellBag(path, args.namespace, args.topics) if args.namespace or args.topics else path
+    """Return the bag at ``path``, with the cell that was asked for of :func:`add_bags`."""
+    return CellBag(path, args.namespace, args.topics) if _asked_for(args) else path
+
+
+def refuse_cell(path: Path, args: argparse.Namespace) -> None:
+    """Raise ConfigurationError if a cell was asked for in ``path``, which is no bag."""
+    if _asked_for(args):
+        raise ConfigurationError(
+            f"{str(path)!r} is read as no bag and has no cells; leave out --namespace and --topics"
+        )
+
+
+def _asked_for(args: argparse.Namespace) -> bool:
+    return bool(args.namespace or args.topics)
 
 
 def add_trigger(sub: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import add_bags, cell_of, number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
@@ -38,14 +38,14 @@ from omsm_ros.units import DEGREE_RAD
 
 
 def _declare_verify(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path, help="a free path (chirp) on a fixed target")
+    add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
 
 
 def _verify(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("reading", args.json) as progress:
-        check = path_check_of(args.bag, calibration, progress)
+        check = path_check_of(cell_of(args.bag, args), calibration, progress)
     bands = [
         {
             "from": low,

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import add_bags, cell_of, number, refuse_cell
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, form_rows
@@ -29,9 +29,7 @@ from omsm_ros.units import DEGREE_RAD
 
 
 def _declare_form(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "measured", type=Path, help="result folder, cloud or map; a scan with its --calibration"
-    )
+    add_bags(sub, "measured", help="result folder, cloud or map; a scan with its --calibration")
     sub.add_argument("--nominal", type=Path, required=True, metavar="SURFACE.yaml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--calibration", type=Path, metavar="CAL.json", help="of a scan")
@@ -53,8 +51,11 @@ def _form(args: argparse.Namespace) -> Facts:
         if args.calibration:
             calibration = load_calibration(args.calibration)
             with progress_bar("correcting", args.json) as progress:
-                measure(source, calibration, out, nominal=surface, report=False, progress=progress)
+                bag = cell_of(source, args)
+                measure(bag, calibration, out, nominal=surface, report=False, progress=progress)
             source = out
+        else:
+            refuse_cell(source, args)
         points = open_measurement(source, args.unit)
         return judge_form(points, surface, out, args.fit, args.aperture, filters)
 

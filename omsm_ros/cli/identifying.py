@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_cell, add_trigger, cell_of, json_object, number, trigger_of
+from omsm_ros.cli.arguments import (
+    add_bags,
+    add_trigger,
+    cell_of,
+    json_object,
+    number,
+    refuse_cell,
+    trigger_of,
+)
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
@@ -31,10 +39,7 @@ TABLE_SUFFIX = ".csv"
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "recording", type=Path, help="a bag of a motion on a fixed target, or a table RECORD.csv"
-    )
-    add_cell(sub)
+    add_bags(sub, "recording", help="a bag of a motion on a fixed target, or a table RECORD.csv")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
         "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
@@ -79,6 +84,7 @@ def _identify(args: argparse.Namespace) -> Facts:
     of_table = args.recording.suffix.lower() == TABLE_SUFFIX
     _check_arguments(args, of_table)
     if of_table:
+        refuse_cell(args.recording, args)
         record = record_of_table(
             args.recording, args.input, args.output, args.period, args.duration
         )

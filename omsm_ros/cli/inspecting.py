@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from omsm_ros.cli.arguments import add_cell, cell_of
+from omsm_ros.cli.arguments import add_bags, cell_of
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path)
-    add_cell(sub)
+    add_bags(sub, "bag")
     sub.add_argument(
         "--repair",
         action="store_true",

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_cell, add_trigger, cell_of, json_object, number, trigger_of
+from omsm_ros.cli.arguments import (
+    add_bags,
+    add_trigger,
+    cell_of,
+    json_object,
+    number,
+    refuse_cell,
+    trigger_of,
+)
 from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
@@ -51,8 +59,7 @@ def geometry_of(path: Path | None) -> Geometry:
 
 
 def _declare_correct(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("bag", type=Path)
-    add_cell(sub)
+    add_bags(sub, "bag")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
@@ -180,7 +187,7 @@ def _show_correct(summary: Facts) -> None:
 
 
 def _declare_predict(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("motion", type=Path, help="a bag, or a planned motion as CSV time_s,z_m")
+    add_bags(sub, "motion", help="a bag, or a planned motion as CSV time_s,z_m")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument(
         "--budget",
@@ -199,11 +206,12 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
 def _predict(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     if args.motion.suffix == ".csv":
+        refuse_cell(args.motion, args)
         z, period = load_motion(args.motion)
         path = ScanPath(z=z, sample_period=period)
     else:
         with progress_bar("reading", args.json) as progress:
-            path = path_in(args.motion, progress)
+            path = path_in(cell_of(args.motion, args), progress)
     limits = load_limits(args.limits) if args.limits else MachineLimits()
     return asdict(predict_error(calibration, path, args.budget, limits))
 

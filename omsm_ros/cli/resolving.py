@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.arguments import add_bags, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
@@ -31,7 +31,7 @@ from omsm_ros.units import RPM_RAD_S
 
 
 def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("scans", type=Path, nargs="+", metavar="SCAN", help="two or more of one part")
+    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more of one part")
     sub.add_argument("--calibration", type=Path, metavar="STEP.json", help="from a step test")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
@@ -75,7 +75,8 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         settings=args.settings,
     )
     with progress_bar("reading", args.json) as progress:
-        found, made, accounts = self_calibration_of(args.scans, step_test, options, progress)
+        bags = [cell_of(path, args) for path in args.scans]
+        found, made, accounts = self_calibration_of(bags, step_test, options, progress)
     path = _kept(args.out, made)
     return {
         **_resolved_facts(made),
@@ -145,8 +146,7 @@ def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
 
 
 def _declare_reversal(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("clockwise", type=Path, metavar="BAG_CW")
-    sub.add_argument("counterclockwise", type=Path, metavar="BAG_CCW")
+    add_bags(sub, "clockwise", "counterclockwise")
     sub.add_argument("--calibration", **CALIBRATION)
     sub.add_argument("--out", type=Path, metavar="CAL.json", help="with the latency in it")
 
@@ -154,7 +154,7 @@ def _declare_reversal(sub: argparse.ArgumentParser) -> None:
 def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("correcting", args.json) as progress:
-        bags = (args.clockwise, args.counterclockwise)
+        bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
         found, accounts = sideways_lag_of(bags, calibration, progress)
     facts = {
         name: getattr(found, name)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import json_object, number
+from omsm_ros.cli.arguments import add_bags, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.readable import plain, quantity
@@ -17,7 +17,7 @@ from omsm_ros.storage.surface_file import load_surface
 
 
 def _declare_spectrum(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("scans", type=Path, nargs="+", metavar="SCAN", help="bags of one part")
+    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="bags of one part")
     sub.add_argument("--calibration", type=Path, metavar="CAL.json", help="to correct with")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="taken off before")
@@ -50,8 +50,9 @@ def _spectrum(args: argparse.Namespace) -> Facts:
         polarity=args.polarity,
     )
     with progress_bar("reading", args.json) as progress:
+        bags = [cell_of(path, args) for path in args.scans]
         return publish_spectra(
-            args.scans, options, args.out, report=not args.no_report, progress=progress
+            bags, options, args.out, report=not args.no_report, progress=progress
         )
 
 

@@ -58,6 +58,11 @@ def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspecti
             for topic, block in bag.records(bags.ACCELERATION_TOPIC):
                 watches[topic].add(block)
         faults = [] if bag.indexed else [_NO_INDEX]
+        faults += [
+            f"no {what}: there is nothing on {bag.name_of(topic)!r} to identify or correct with"
+            for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance"))
+            if topic not in watches
+        ]
     streams = [_inspect(t, watches.get(t.role)) for t in topics]
     return Inspection(streams, [*faults, *_faults(watches)])
 
@@ -76,9 +81,6 @@ def _faults(watches: dict[str, StreamWatch]) -> Iterator[str]:
         period = min(axes.periods)
         if period == min(distance.periods):
             yield from skew_fault(counter_skew(axes, distance), period)
-    for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance")):
-        if topic not in watches:
-            yield f"no {what}: there is nothing on {topic!r} to identify or correct with"
 
 
 def _inspect(topic: bags.TopicSummary, watch: StreamWatch | None) -> StreamInspection:

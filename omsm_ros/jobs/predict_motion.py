@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from omsm_ros.core.correction.predict import Prediction, predict_error
@@ -22,7 +20,7 @@ def predict_from(
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
-        return predict_error(calibration, path_in(Path(bag)))
+        return predict_error(calibration, path_in(bag))
     SAMPLE_PERIOD.checked(sample_period, name="sample_period")
     positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
     return predict_error(calibration, ScanPath(z=positions, sample_period=sample_period))

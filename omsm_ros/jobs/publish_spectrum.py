@@ -16,13 +16,14 @@ from omsm_ros.jobs.spectrum import (
 )
 from omsm_ros.storage.cloud_file import PlyWriter
 from omsm_ros.storage.files import REPORT, save_json, save_text
+from omsm_ros.storage.recording.topics import AnyBag
 from omsm_ros.storage.result_folder import result_folder
 
 SPECTRUM = "spectrum.json"
 
 
 def publish_spectra(
-    paths: Sequence[Path],
+    paths: Sequence[AnyBag],
     options: SpectrumOptions,
     out: Path,
     *,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from omsm_ros.core.machine.limits import PathStart, ScanPath
 from omsm_ros.core.samples.blocks import Block
@@ -38,7 +37,7 @@ def read_blocks(
 # ------------------------------------------------------------------------------- preview
 
 
-def path_in(path: Path, progress: Progress = no_progress) -> ScanPath:
+def path_in(path: AnyBag, progress: Progress = no_progress) -> ScanPath:
     """Return the start of the path that a bag holds, with its readings where it has some."""
     start = PathStart(MOST_JUDGED)
     with bags.BagReader(path) as bag:
@@ -48,7 +47,8 @@ def path_in(path: Path, progress: Progress = no_progress) -> ScanPath:
         for done, _, block in bag.blocks(*present):
             start.add(block)
             progress(done, total)
+        name = bag.name_of(bags.AXES_TOPIC)
     found = start.path()
     if found is None:
-        raise BagError(f"{str(path)!r} has no samples on {bags.AXES_TOPIC!r}; record a motion")
+        raise BagError(f"{str(path)!r} has no samples on {name!r}; record a motion")
     return found

@@ -34,6 +34,7 @@ from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.topics import AnyBag
 
 SCHEMA = "omsm-spectrum/1"
 NORMALISATION = (
@@ -88,7 +89,7 @@ class _Read:
 
 
 def spectra_of(
-    paths: Sequence[Path], options: SpectrumOptions, progress: Progress = no_progress
+    paths: Sequence[AnyBag], options: SpectrumOptions, progress: Progress = no_progress
 ) -> list[SpectrumOfScan]:
     """Study all scans, and say of each line of each what it is.
 
@@ -113,13 +114,13 @@ def spectra_of(
     ]
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
+def _names(paths: Sequence[AnyBag]) -> list[str]:
     """Of the files, told apart by a number where two have the same."""
-    stems = [path.stem for path in paths]
+    stems = [Path(str(path)).stem for path in paths]
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
 
-def _read(path: Path, name: str, options: SpectrumOptions, progress: Progress) -> _Read:
+def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> _Read:
     axes: list[AxisBlock] = []
     parts: list[SurfacePoints] = []
     calibration = options.calibration or unit_calibration(_period_of(path))
@@ -151,16 +152,16 @@ def _read(path: Path, name: str, options: SpectrumOptions, progress: Progress) -
     )
 
 
-def _period_of(path: Path) -> float:
+def _period_of(path: AnyBag) -> float:
     with bags.BagReader(path) as bag:
         for _, block in bag.records(bags.DISTANCE_TOPIC):
             return float(block.sample_period)
     raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
 
 
-def _felt(path: Path) -> Felt | None:
+def _felt(path: AnyBag) -> Felt | None:
     with bags.BagReader(path) as bag:
-        if not any(t.topic == bags.ACCELERATION_TOPIC and t.messages for t in bag.topics()):
+        if not any(t.role == bags.ACCELERATION_TOPIC and t.messages for t in bag.topics()):
             return None
         blocks = [block for _, block in bag.records(bags.ACCELERATION_TOPIC)]
     return felt(*accelerations_of([b for b in blocks if isinstance(b, AccelerationBlock)]))

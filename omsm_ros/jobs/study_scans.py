@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -32,13 +31,14 @@ from omsm_ros.errors import BagError
 from omsm_ros.jobs.corrected_scan import CorrectedScan
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
+from omsm_ros.storage.recording.topics import AnyBag
 
 # What is to be found must not be in the points already.
 _PLAIN = CorrectionOptions(lateral_lag=0.0)
 
 
 def sideways_lag_of(
-    bag_paths: Sequence[Path], calibration: Calibration, progress: Progress = no_progress
+    bag_paths: Sequence[AnyBag], calibration: Calibration, progress: Progress = no_progress
 ) -> tuple[SidewaysLag, list[Account]]:
     """Lag of the probe against X and C from scans with opposite spindle directions.
 
@@ -67,7 +67,7 @@ class SelfCalibrationOptions:
 
 
 def self_calibration_of(
-    bag_paths: Sequence[Path],
+    bag_paths: Sequence[AnyBag],
     step_test: Calibration | None,
     options: SelfCalibrationOptions,
     progress: Progress = no_progress,
@@ -89,7 +89,7 @@ def self_calibration_of(
     return found, alone, accounts
 
 
-def _sample_period_of(path: Path) -> float:
+def _sample_period_of(path: AnyBag) -> float:
     with bags.BagReader(path) as bag:
         for _, block in bag.records(bags.DISTANCE_TOPIC):
             return float(block.sample_period)
@@ -97,7 +97,7 @@ def _sample_period_of(path: Path) -> float:
 
 
 def _read_scans(
-    bag_paths: Sequence[Path],
+    bag_paths: Sequence[AnyBag],
     calibration: Calibration,
     options: CorrectionOptions,
     progress: Progress,
@@ -118,7 +118,7 @@ def _read_scans(
 
 
 def alignment_of(
-    path: Path,
+    path: AnyBag,
     calibration: Calibration,
     radius: float,
     geometry: Geometry,

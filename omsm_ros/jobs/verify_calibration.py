@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -14,12 +12,13 @@ from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.core.verification.free_path import PathCheck, check_path
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.storage.recording.topics import AnyBag
 
 _START_SAMPLES = 12
 
 
 def path_check_of(
-    path: Path, calibration: Calibration, progress: Progress = no_progress
+    path: AnyBag, calibration: Calibration, progress: Progress = no_progress
 ) -> PathCheck:
     """The paper's Fig. 9: errors and phase lags of a free path on a fixed target."""
     record = motion_of_bag(path, progress=progress)

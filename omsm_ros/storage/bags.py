@@ -139,6 +139,10 @@ class BagReader:
             for (name, kind), count in sorted(counts.items())
         ]
 
+    def name_of(self, topic: str) -> str:
+        """Return what ``topic`` of the contract is called in this bag, or would be."""
+        return self._names[topic]
+
     @property
     def indexed(self) -> bool:
         """Whether the recording was completed; an MCAP file that was not has no index."""

@@ -1,10 +1,13 @@
 """Commands read the bag of a second cell, by its namespace or the names of its topics."""
 
+import argparse
 import json
+from pathlib import Path
 
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.cli.main import parser_of
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.recording.bag_writer import BagWriter
@@ -45,6 +48,72 @@ def test_a_second_cell_is_inspected_and_corrected(
     summary = json.loads(capsys.readouterr().out)
     assert summary["samples"]["axes"]["received"] == 1000
     assert summary["bag"] == str(second)
+
+
+# Every command that reads a bag, as far as it needs to begin to.
+OF_A_BAG = {
+    "inspect": [],
+    "correct": ["--calibration", "CAL", "--out", "OUT"],
+    "identify": ["--out", "OUT"],
+    "verify": ["--calibration", "CAL"],
+    "predict": ["--calibration", "CAL"],
+    "align": ["--calibration", "CAL", "--radius", "0.1", "--out", "OUT"],
+    "selfcal": ["BAG", "--calibration", "CAL", "--out", "OUT"],
+    "reversal": ["BAG", "--calibration", "CAL"],
+    "spectrum": ["--out", "OUT"],
+    "form": ["--calibration", "CAL", "--nominal", "SURFACE", "--out", "OUT"],
+}
+SURFACE = Path(__file__).parents[2] / "config" / "paper_mirror.yaml"
+
+
+def of_a_bag(command, bag, folder):
+    places = {"BAG": bag, "CAL": folder / "cal.json", "OUT": folder / "out", "SURFACE": SURFACE}
+    return [command, str(bag), *(str(places.get(word, word)) for word in OF_A_BAG[command])]
+
+
+@pytest.mark.parametrize("command", OF_A_BAG)
+def test_every_command_of_a_bag_looks_for_the_cell_that_is_asked_for(
+    capsys, tmp_path, second, true_calibration, command
+):
+    save_calibration(tmp_path / "cal.json", true_calibration)
+    asked = of_a_bag(command, second, tmp_path)
+    status = cli.main([*asked, "--namespace", "/cell3"])
+    told = capsys.readouterr()
+    if command == "inspect":  # shows what there is of the cell: nothing
+        assert status == 0
+        assert "nothing on '/cell3/axes'" in told.out
+    else:
+        assert status == 2
+        assert "/cell3/" in told.err
+
+
+def test_no_command_of_a_bag_is_forgotten():
+    actions = parser_of("")._actions
+    (words,) = (a for a in actions if isinstance(a, argparse._SubParsersAction))
+    with_cells = {
+        name
+        for name, sub in words.choices.items()
+        if any(action.dest == "namespace" for action in sub._actions)
+    }
+    assert with_cells == set(OF_A_BAG)
+
+
+@pytest.mark.parametrize(
+    ("command", "file", "options"),
+    [
+        ("predict", "motion.csv", []),
+        ("identify", "record.csv", ["--input", "u", "--output", "y", "--period", "0.001"]),
+        ("form", "cloud.ply", []),
+    ],
+)
+def test_what_is_no_bag_has_no_cells(capsys, tmp_path, true_calibration, command, file, options):
+    save_calibration(tmp_path / "cal.json", true_calibration)
+    asked = of_a_bag(command, tmp_path / file, tmp_path)
+    if command == "form":  # with a calibration it would be a scan
+        place = asked.index("--calibration")
+        del asked[place : place + 2]
+    assert cli.main([*asked, *options, "--namespace", "/cell2"]) == 2
+    assert "has no cells" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
