@@ -18,8 +18,6 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
-from omsm_ros.core.surface import deviation as form
-from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.emulators.players import emulated
 from omsm_ros.errors import OmsmError
@@ -32,7 +30,7 @@ from omsm_ros.readable import quantity
 from omsm_ros.report.common import response_figures, style
 from omsm_ros.report.measurement.cloud_view import CloudView
 from omsm_ros.report.measurement.figures import overview_figure
-from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.report.measurement.gallery import levelled, surface_figures
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.cloud_file import CloudFile
@@ -249,11 +247,7 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
 
 def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
     """One wide picture: map before in µm, after in nm, identified and true response."""
-    weights = area_weights(view.x, view.y)
-    raw, corrected = (
-        form.level(view.x, view.y, form.deviation(view.x, view.y, h, PAPER_MIRROR), weights=weights)
-        for h in (view.raw_height, view.height)
-    )
+    raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
     figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
     return style.png(figure, dpi=120)
 

@@ -109,8 +109,9 @@ def _publish(
     # Here, because drawing takes longer to load than a scan to correct.
     from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
 
-    figures = figures_of(done.points, calibration, nominal, done.sample_period)
-    surface = map_of(view_of(done.points, done.sample_period), nominal, out)
+    view = view_of(done.points, done.sample_period)
+    figures = figures_of(view, calibration, nominal, done.sample_period)
+    surface = map_of(view, nominal, out)
     publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
 
 

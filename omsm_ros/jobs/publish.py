@@ -28,13 +28,12 @@ _MAX_FORM_BYTES = 10_000_000
 
 
 def figures_of(
-    cloud: NDArray[np.void],
+    view: CloudView | None,
     calibration: Calibration,
     nominal: Surface | None,
     sample_period: float,
 ) -> dict[str, bytes]:
     """PNG files for the page of a cloud whose truth nobody knows."""
-    view = view_of(cloud, sample_period)
     figures = surface_figures(view, nominal) if view is not None else {}
     return figures | {"bode": style.png(bode(calibration, None, sample_period))}
 

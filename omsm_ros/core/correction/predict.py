@@ -14,20 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.uncertainty import (
-    ErrorSources,
-    past_of,
-    sensitivity_filters,
-    uncertain_parts,
+from omsm_ros.core.correction.motion_residual import (
+    START_SAMPLES,
+    Residual,
+    running_mean,
+    through,
 )
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
-from omsm_ros.core.dynamics.discretisation_error import (
-    checked_motion,
-    fast_length,
-    velocity_spectrum,
-)
-from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.discretisation import discretise
+from omsm_ros.core.dynamics.discretisation_error import checked_motion, velocity_spectrum
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.limits import (
     FASTEST,
@@ -47,16 +42,8 @@ DEFAULT_BUDGET_M = 50 * NANOMETRE_M
 DYNAMICS = "dynamics"
 """Name of the limit that the calibration itself sets."""
 
-# As few as a parabola through noisy samples allows; the motion has hardly bent meanwhile.
-_START_SAMPLES = 12
 # The speed is sought on the worst stretches of the path and proved on the whole of it.
 _STRETCH_SAMPLES = 8192
-# The band that counts as trusted ends between these shares of the frequency of trust.
-_PASSED_SHARE = 0.8
-# A millimetre of travel through the stop band is then ten nanometres, of which 1 - G passes.
-_ATTENUATION_DB = 100.0
-# An error beyond the band is taken as its rms over so many seconds.
-_RUNNING_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -103,15 +90,14 @@ def predict_error(
     path = replace(path, z=checked_motion(path.z))
     error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
     spread = float(np.ptp(error))
-    dynamics, residual = _dynamics_limit(calibration, path, budget)
-    hidden = _hidden_at_worst(calibration, path)
+    dynamics, hidden = _dynamics_limit(calibration, path, budget)
     others, missing = speed_limits(path, limits or MachineLimits(), calibration.valid_up_to, budget)
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
     return Prediction(
         peak_to_valley=spread,
         rms=float(np.std(error)),
-        residual=residual,
+        residual=dynamics.value,
         residual_hidden=hidden,
         outside_band_fraction=_outside_fraction(calibration, path),
         speed_factor=binding.speed_factor,
@@ -119,143 +105,46 @@ def predict_error(
         binding=binding.name,
         limits=every,
         not_evaluated=tuple(missing),
-        message=_message(calibration, spread, (residual, hidden), budget, binding),
+        message=_message(calibration, spread, (dynamics.value, hidden), budget, binding),
     )
 
 
 def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: float) -> FloatArray:
     """Return (1 - G) z [m] (Eq. 5) after the filter has settled, shape (n - settling,)."""
     digital = discretise(dynamics, sample_period)
-    settling = max(digital.settling_samples(SETTLED), _START_SAMPLES)
+    settling = max(digital.settling_samples(SETTLED), START_SAMPLES)
     if len(z) <= 2 * settling:
         raise DataError(
             f"motion of {len(z)} samples, expected more than {2 * settling}: the filter needs "
             f"{settling} to settle"
         )
-    return (z - _through(digital, z))[settling:]
-
-
-def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: float) -> FloatArray:
-    """Return the standard uncertainty of G z that the correction leaves [m], at most (n,).
-
-    Within the trusted band it is that of the calibration's covariance, and above it the whole
-    (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
-    it at either, the motion above the band is taken to be as large as next to them.
-    """
-    known, hidden = _residual_variances(calibration, z, sample_period)
-    return np.asarray(np.sqrt(known + hidden))
-
-
-def _residual_variances(
-    calibration: Calibration, z: FloatArray, sample_period: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the variance of the residual [m²] but for what could hide, and that of it."""
-    noise, hidden = (_variance(part, z, sample_period) for part in uncertain_parts(calibration))
-    digital = discretise(calibration.dynamics, sample_period)
-    known = noise + ErrorSources.of(calibration).motion_error ** 2
-    known += _missed_beyond(calibration.valid_up_to, digital, z)
-    settling = min(max(digital.settling_samples(SETTLED), _START_SAMPLES), len(z) // 4)
-    return known[settling:], hidden[settling:]
-
-
-def _variance(calibration: Calibration, z: FloatArray, sample_period: float) -> FloatArray:
-    """Return the variance of G z [m²] from the covariance of ``calibration``, (n,)."""
-    variance = np.zeros(len(z))
-    for digital in sensitivity_filters(calibration, sample_period):
-        recursion = Recursion(digital)
-        recursion.start(past_of(calibration)(z[:_START_SAMPLES]))
-        variance += recursion.run(z) ** 2
-    return variance
-
-
-def _hidden_at_worst(calibration: Calibration, path: ScanPath) -> float:
-    """Return what could hide, of the residual where that is largest [m]."""
-    known, hidden = _residual_variances(calibration, path.z, path.sample_period)
-    return float(np.sqrt(hidden[np.argmax(known + hidden)]))
-
-
-def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
-    """Return the mean square of (1 - G) z above ``up_to`` [Hz], running over the record, (n,)."""
-    kernel = _band_kernel(up_to, digital.sample_period, len(z))
-    half = len(kernel) // 2
-    if not half:
-        return np.zeros(len(z))
-    centred = z - z[0]
-    # Beyond the kernel's reach the record's ends would count as motion.
-    fast = (centred - _convolved(centred, kernel))[half:-half]
-    missed = _running_mean(
-        (fast - _through(digital, fast)) ** 2, round(_RUNNING_S / digital.sample_period)
-    )
-    return np.pad(missed, half, mode="edge")
-
-
-def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray:
-    """Return a low-pass of linear phase that falls from 0.8 ``up_to`` to ``up_to`` [Hz].
-
-    By Kaiser's window, 100 dB or what fits into half of ``samples``; one tap where all passes.
-    """
-    if up_to >= 0.5 / sample_period:
-        return np.ones(1)
-    transition = (1 - _PASSED_SHARE) * up_to * sample_period
-    # Kaiser (1974): taps and shape for an attenuation over a transition.
-    half = int(np.ceil((_ATTENUATION_DB - 8) / (2.285 * 2 * np.pi * transition) / 2))
-    half = min(half, samples // 4)
-    index = np.arange(-half, half + 1)
-    cutoff = (1 + _PASSED_SHARE) / 2 * up_to * sample_period
-    kernel = 2 * cutoff * np.sinc(2 * cutoff * index)
-    kernel = kernel * np.kaiser(len(index), 0.1102 * (_ATTENUATION_DB - 8.7))
-    return np.asarray(kernel / kernel.sum())
-
-
-def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Return the convolution (n,), by FFT; true where the kernel lies inside the record."""
-    # In stretches of eight kernels, each with the values that reach into it (overlap and save).
-    reach = len(kernel) - 1
-    length = min(fast_length(8 * len(kernel)), fast_length(len(values) + reach))
-    step = length - reach
-    stretches = -(-(len(values) + reach) // step)
-    padded = np.zeros(stretches * step + reach)
-    padded[reach : reach + len(values)] = values
-    rows = np.lib.stride_tricks.sliding_window_view(padded, length)[::step]
-    spectra = np.fft.rfft(rows) * np.fft.rfft(kernel, length)
-    whole = np.fft.irfft(spectra, length)[:, reach:].ravel()
-    return np.asarray(whole[reach // 2 : reach // 2 + len(values)])
-
-
-def _through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
-    recursion = Recursion(digital)
-    recursion.start(past_motion(z[:_START_SAMPLES]))
-    return recursion.run(z)
-
-
-def _running_mean(values: FloatArray, width: int) -> FloatArray:
-    """Return the mean of the nearest ``width`` values, (n,)."""
-    width = int(np.clip(width, 1, len(values)))
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    means = np.maximum(total[width:] - total[:-width], 0.0) / width
-    before = width // 2
-    return np.pad(means, (before, len(values) - len(means) - before), mode="edge")
+    return (z - through(digital, z))[settling:]
 
 
 def _dynamics_limit(
     calibration: Calibration, path: ScanPath, budget: float
 ) -> tuple[SpeedLimit, float]:
-    """Return the limit that the correction's residual sets, and that residual as it is [m]."""
+    """Return the limit that the correction's residual sets.
+
+    With it the part of that residual, as the path is, that could hide in the step test [m].
+    """
     z, period, allowed = path.z, path.sample_period, budget / 2
-    here = residual_over_time(calibration, z, period)
+    known, hidden = Residual(calibration, period).variances(z)
+    here = np.sqrt(known + hidden)
     residual = float(np.max(here))
     stretches = _worst_stretches(z, here)
 
     def worst(factor: float) -> float:
-        faster = period / factor
-        return max(float(np.max(residual_over_time(calibration, s, faster))) for s in stretches)
+        faster = Residual(calibration, period / factor)
+        return max(map(faster.largest, stretches))
 
-    factor = highest_factor(worst, allowed)
+    factor = highest_factor(worst, allowed, residual)
     if 0 < factor < FASTEST or (factor == FASTEST and residual > 0):
         # A path of which a stretch is within the budget need not be so as a whole.
-        whole = float(np.max(residual_over_time(calibration, z, period / factor)))
+        whole = Residual(calibration, period / factor).largest(z)
         factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
-    return SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor)), residual
+    limit = SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor))
+    return limit, float(np.sqrt(hidden[np.argmax(known + hidden)]))
 
 
 def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
@@ -264,7 +153,7 @@ def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
         return [z]
     starts = set()
     for signal in (residual, np.abs(np.diff(z)), np.abs(np.diff(z, 2))):
-        level = _running_mean(signal, _STRETCH_SAMPLES // 8)
+        level = running_mean(signal, _STRETCH_SAMPLES // 8)
         middle = int(np.argmax(level)) + len(z) - len(signal)
         starts.add(int(np.clip(middle - _STRETCH_SAMPLES // 2, 0, len(z) - _STRETCH_SAMPLES)))
     return [z[start : start + _STRETCH_SAMPLES] for start in sorted(starts)]

@@ -138,22 +138,34 @@ class SpeedLimit:
     speed_factor: float
 
 
-def highest_factor(value_at: Callable[[float], float], allowed: float) -> float:
+def highest_factor(
+    value_at: Callable[[float], float], allowed: float, now: float | None = None
+) -> float:
     """Return the largest speed factor at which ``value_at(factor)``, which rises, is allowed.
+
+    now: ``value_at(1)``, where it is known already
 
     Between 1 / FASTEST and FASTEST, and never too large; 0 if it is not allowed at any. What
     grows with a power of the speed is a straight line over logarithms, so that false position
     (Illinois: an end that stays counts half) needs few of the values, which cost time.
     """
 
-    def excess(logarithm: float) -> float:
-        return float(np.log(max(value_at(float(np.exp(logarithm))) / allowed, _TINY)))
+    def over(value: float) -> float:
+        return float(np.log(max(value / allowed, _TINY)))
 
-    low, high = -float(np.log(FASTEST)), float(np.log(FASTEST))
-    if (above := excess(high)) <= 0:
-        return FASTEST
-    if (below := excess(low)) > 0:
-        return 0.0
+    def excess(logarithm: float) -> float:
+        return over(value_at(float(np.exp(logarithm))))
+
+    low = high = 0.0
+    below = above = excess(0.0) if now is None else over(now)
+    if below <= 0:
+        high = float(np.log(FASTEST))
+        if (above := excess(high)) <= 0:
+            return FASTEST
+    else:
+        low = -float(np.log(FASTEST))
+        if (below := excess(low)) > 0:
+            return 0.0
     stayed = 0
     while high - low > _PRECISION:
         middle = low + (high - low) * below / (below - above)
@@ -286,8 +298,9 @@ def _following(path: ScanPath, limits: MachineLimits) -> SpeedLimit | str:
         # More than the servo's own error is shape, tilt and set-up, whatever the speed; less
         # shows a servo that is better than declared.
         taken, share = max(span - now, 0.0), min(span / now, 1.0) if now else 1.0
-    factor = highest_factor(lambda k: share * excursion(k) + taken, limits.probe_range / 2)
-    return SpeedLimit(name, share * now + taken, limits.probe_range / 2, "m", factor)
+    value, allowed = share * now + taken, limits.probe_range / 2
+    factor = highest_factor(lambda k: share * excursion(k) + taken, allowed, value)
+    return SpeedLimit(name, value, allowed, "m", factor)
 
 
 def _spindle_rpm(path: ScanPath) -> float | None:

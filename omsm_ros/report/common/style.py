@@ -31,6 +31,8 @@ _NAME_LEFT_OF_AXES_IN = 0.58
 TEXT_PT = 8.5
 TITLE_PT = 10.0
 FIGURE_DPI = 180
+# Level 4 is twice as fast as the usual 6, and the file a few per cent larger.
+FAST_PNG = {"compress_level": 4}
 
 
 def empty(width: float, height: float) -> Figure:
@@ -119,12 +121,7 @@ def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelop
 def png(made: Figure, dpi: int = FIGURE_DPI) -> bytes:
     """The figure as a PNG file, the same bytes for the same figure."""
     buffer = io.BytesIO()
-    # Level 4 is twice as fast as the usual 6, and the file a few per cent larger.
     made.savefig(
-        buffer,
-        format="png",
-        dpi=dpi,
-        metadata={"Software": None},
-        pil_kwargs={"compress_level": 4},
+        buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs=dict(FAST_PNG)
     )
     return buffer.getvalue()

@@ -124,5 +124,5 @@ def _png(codes: np.ndarray) -> str:
     """A picture whose red and green are the two bytes of each code, first row lowest."""
     pixels = np.stack([codes >> 8, codes & 255, np.zeros_like(codes)], axis=2).astype(np.uint8)
     content = io.BytesIO()
-    imsave(content, pixels, format="png")
+    imsave(content, pixels, format="png", pil_kwargs=dict(style.FAST_PNG))
     return b64encode(content.getvalue()).decode()

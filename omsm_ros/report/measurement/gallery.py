@@ -7,7 +7,6 @@ import numpy as np
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface import deviation as form
-from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.report.common import style
 from omsm_ros.report.measurement import figures
 from omsm_ros.report.measurement.cloud_view import CloudView
@@ -28,12 +27,11 @@ def surface_figures(
 
     true_height, true_error_left: of each point [m], (n,), known on the twin only
     """
-    weights = area_weights(cloud.x, cloud.y)
     made = {"dynamic_error": _error_trace(cloud, true_error_left)}
     if true_error_left is not None:
         made["error_histogram"] = style.png(
             figures.error_histogram(
-                cloud.dynamic_error, true_error_left, weights, left="after (true error left)"
+                cloud.dynamic_error, true_error_left, cloud.area, left="after (true error left)"
             )
         )
     if nominal is None:
@@ -48,7 +46,7 @@ def surface_figures(
 def levelled(cloud: CloudView, height: FloatArray, nominal: Surface) -> FloatArray:
     """Return ``height`` (n,) [m] less the nominal surface and its mean over the area."""
     away = form.deviation(cloud.x, cloud.y, height, nominal)
-    return form.level(cloud.x, cloud.y, away, weights=area_weights(cloud.x, cloud.y))
+    return form.level(cloud.x, cloud.y, away, weights=cloud.area)
 
 
 def _error_trace(cloud: CloudView, left: FloatArray | None) -> bytes:

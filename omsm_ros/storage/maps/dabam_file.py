@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
@@ -87,6 +86,9 @@ def read_dabam(path: Path) -> MeasuredPoints:
     profile = load_dabam(path)
     height, notes = profile.value, ("a profile along x",)
     if profile.slopes:
+        # Here, because to load it takes half a second, and every map passes through this module.
+        from scipy.integrate import cumulative_trapezoid
+
         height = cumulative_trapezoid(profile.value, profile.position, initial=0.0)
         notes = ("a profile along x; its slopes were integrated",)
     return measured(profile.position, np.zeros_like(height), height, notes=notes)

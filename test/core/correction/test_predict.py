@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import interpolate, signal
 
+from omsm_ros.core.correction.motion_residual import residual_over_time
 from omsm_ros.core.correction.predict import (
     Prediction,
     dynamic_error,
     predict_error,
-    residual_over_time,
 )
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction

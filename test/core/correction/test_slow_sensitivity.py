@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.predict import predict_error, residual_over_time
+from omsm_ros.core.correction.motion_residual import residual_over_time
+from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction

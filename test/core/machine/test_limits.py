@@ -201,6 +201,18 @@ def test_highest_factor_of_a_power_takes_few_values(power: float, factor: float)
     assert len(asked) < 10
 
 
+@pytest.mark.parametrize("factor", [0.2, 7.0])
+def test_highest_factor_asks_only_on_the_side_of_what_is_known(factor: float) -> None:
+    asked: list[float] = []
+
+    def value(k: float) -> float:
+        asked.append(k)
+        return k / factor
+
+    assert highest_factor(value, 1.0, now=1 / factor) == pytest.approx(factor, rel=1e-3)
+    assert all((k > 1) == (factor > 1) for k in asked)
+
+
 def test_highest_factor_of_a_bend_and_of_a_jump() -> None:
     # Noise at low speed, a resonance at high: the line is broken twice.
     found = highest_factor(lambda k: 1.0 + k**2 + 1e-3 * k**6, 30.0)
