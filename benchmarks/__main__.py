@@ -23,6 +23,7 @@ PARTS = (
         "disturbed",
         "free_path",
         "correction",
+        "honesty",
         "speed",
         "offline",
         "live",
