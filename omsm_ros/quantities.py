@@ -210,6 +210,8 @@ PROCESSES = Quantity("processes", "", 1, 1024, "one a core serves best", whole=T
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
 PLAY_RATE = Quantity("rate of playing", "", 0.0, 1e4, "1 = as recorded, 0 = as fast as can be")
 PLAY_TIME = Quantity("time within a recording", "s", 0.0, 1e8, "give it in seconds")
+# A day of blocks of 0.1 s.
+QUEUE_DEPTH = Quantity("depth of a queue", "", 1, 1e6, "give a number of messages", whole=True)
 LISTENERS = Quantity("listeners", "", 0, 1000, "0 = begin at once", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.

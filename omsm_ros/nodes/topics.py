@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from copy import copy
 from typing import Any, TypeAlias
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -15,6 +18,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
+from omsm_ros import quantities
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.storage import strict_json
 
 MessageInfo: TypeAlias = "dict[str, int]"
@@ -54,7 +59,9 @@ def publish_on(
     node: Node, undo: ExitStack, kind: Any, topic: str, qos: QoSProfile = SAMPLES_QOS
 ) -> Publisher:
     """Return a publisher, which ends with ``undo``; parameters qos_overrides.* are honoured."""
-    made = node.create_publisher(kind, topic, qos, qos_overriding_options=_overriding())
+    with _overrides_understood(topic):
+        # A copy, for rclpy writes the overrides into what it is given.
+        made = node.create_publisher(kind, topic, copy(qos), qos_overriding_options=_overriding())
     undo.callback(node.destroy_publisher, made)
     return made
 
@@ -91,15 +98,16 @@ def listen(
     events = SubscriptionEventCallbacks(
         message_lost=None if lost is None else lambda event: lost(event.total_count)
     )
-    made = node.create_subscription(
-        kind,
-        topic,
-        take_all,
-        qos,
-        raw=raw,
-        event_callbacks=events,
-        qos_overriding_options=_overriding(),
-    )
+    with _overrides_understood(topic):
+        made = node.create_subscription(
+            kind,
+            topic,
+            take_all,
+            copy(qos),
+            raw=raw,
+            event_callbacks=events,
+            qos_overriding_options=_overriding(),
+        )
     undo.callback(node.destroy_subscription, made)
     return made
 
@@ -121,6 +129,22 @@ def tell_taken(request: Trigger.Request, response: Trigger.Response) -> Trigger.
     return response
 
 
+@contextmanager
+def _overrides_understood(topic: str) -> Iterator[None]:
+    """Raise ConfigurationError for a parameter qos_overrides.* of no kind that there is."""
+    try:
+        yield
+    except (RuntimeError, InvalidParameterTypeException) as err:
+        raise ConfigurationError(
+            f"quality of service of {topic!r}: {err}; see parameters qos_overrides.*"
+        ) from err
+
+
 def _overriding() -> QoSOverridingOptions:
     kinds = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
-    return QoSOverridingOptions((*kinds, QoSPolicyKind.DURABILITY))
+    return QoSOverridingOptions((*kinds, QoSPolicyKind.DURABILITY), callback=_possible)
+
+
+def _possible(qos: QoSProfile) -> SetParametersResult:
+    quantities.QUEUE_DEPTH.checked(qos.depth, ConfigurationError)
+    return SetParametersResult(successful=True)

@@ -11,6 +11,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from omsm_msgs.srv import LoadCalibration
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import ReliabilityPolicy
 
 from omsm_ros.storage.calibration_file import save_calibration
 
@@ -123,6 +124,17 @@ def start(node, *arguments):
             "qos_overrides./x",
             marks=pytest.mark.soak,
         ),
+        (
+            "corrector",
+            ["-p", "qos_overrides./omsm/points.publisher.reliability:=sometimes"],
+            "'points': Unexpected QoS override for policy `reliability`: `sometimes`",
+        ),
+        pytest.param(
+            "corrector",
+            ["-p", "qos_overrides./omsm/axes.subscription.depth:=99999999999"],
+            "depth of a queue is 99999999999",
+            marks=pytest.mark.soak,
+        ),
         ("corrector", ["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
         ("confocal_driver", ["-p", "block_size:=-7", "-p", "port:=/dev/null"], "block_size"),
         ("confocal_driver", ["-p", "port:=/dev/null"], "'x.counts_per_unit' is not stated"),
@@ -133,6 +145,23 @@ def test_what_cannot_be_meant_is_one_line_and_exit_2(node, arguments, named):
     assert done.returncode == 2, done.stderr
     assert named in done.stderr.strip().splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+def test_an_override_is_of_its_topic_alone(cell):
+    """Others that are made with the same quality of service keep it."""
+    cell.processes.start(
+        "corrector",
+        **{
+            "qos_overrides./omsm/points.publisher.reliability": "best_effort",
+            "qos_overrides./omsm/points.publisher.depth": 7,
+        },
+    )
+    cell.wait("it", lambda: cell.operator.text("corrector", "lifecycle") == "active")
+    (points,) = cell.operator.get_publishers_info_by_topic("/omsm/points")
+    assert points.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
+    for topic in ("axes", "confocal"):
+        (heard,) = cell.operator.get_subscriptions_info_by_topic(f"/omsm/{topic}")
+        assert heard.qos_profile.reliability is ReliabilityPolicy.RELIABLE
 
 
 @pytest.mark.parametrize("node", ["cell_emulator", "confocal_driver"])
