@@ -5,6 +5,7 @@ ros2 launch omsm_ros cell.launch.py emulated:=true namespace:=cell2 record:=scan
 """
 
 from pathlib import Path
+from zlib import crc32
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
@@ -52,7 +53,9 @@ def cell(context: LaunchContext) -> list[Node]:
         node(given, "corrector", {}),
     ]
     if given["record"]:
-        nodes.append(node(given, "recorder", {"path": given["record"]}))
+        # One that is started again goes on beside what it had recorded.
+        goes_on = given["respawn"] == "true"
+        nodes.append(node(given, "recorder", {"path": given["record"], "numbered": goes_on}))
     if given["view"] == "true":
         nodes.append(node(given, "viewer", {}))
     if given["rviz"] == "true":
@@ -84,7 +87,8 @@ def twin(namespace: str, device: str) -> tuple[dict[str, object], dict[str, obje
         raise ValueError(f"device {device!r} has no emulator, expected one of {sorted(EMULATED)}")
     port = str(runtime_folder(namespace) / "cell")
     if EMULATED[device].tcp:
-        port = "tcp://127.0.0.1:7000"
+        # Another one for each cell, else a second driver would read the first cell's device.
+        port = f"tcp://127.0.0.1:{7000 + crc32(namespace.strip('/').encode()) % 1000}"
     return (
         {"device": device, "link": port},
         {"device": device, "port": port, **emulated(device).driver},

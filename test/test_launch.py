@@ -98,16 +98,19 @@ def test_an_emulated_cell_reads_what_is_played(launch, device, monkeypatch, tmp_
 
 def test_two_emulated_cells_have_ports_of_their_own(launch, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    links = {
-        launch(emulated="true", namespace=name)["cell_emulator"].parameters[1]["link"]
-        for name in ("omsm", "cell2")
-    }
-    assert len(links) == 2
+    for device in ("six_channel", "chrocodile_packet"):
+        links = {
+            launch(emulated="true", device=device, namespace=name)["cell_emulator"].parameters[1][
+                "link"
+            ]
+            for name in ("omsm", "cell2")
+        }
+        assert len(links) == 2
 
 
 def test_arguments_reach_the_nodes(launch):
     nodes = launch(record="scan.mcap", rviz="true", log_level="debug", respawn="true")
-    assert nodes["recorder"].parameters[1] == {"path": "scan.mcap"}
+    assert nodes["recorder"].parameters[1] == {"path": "scan.mcap", "numbered": True}
     assert nodes["corrector"].respawn
     assert nodes["corrector"].arguments == ["--ros-args", "--log-level", "debug"]
     assert Path(nodes["rviz2"].arguments[1]).is_file()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 
 from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
 from rclpy.clock import Clock, ClockType
@@ -19,10 +20,11 @@ from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_waiting
 from omsm_ros.parameters import Parameter
 from omsm_ros.storage.recording import topics
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.storage.recording.bag_writer import BagWriter, next_free
 
 PARAMETERS = (
     Parameter("path", "", "the .mcap file to write; it must not exist yet", required=True),
+    Parameter("numbered", False, "where it exists, write scan.2.mcap, scan.3.mcap, … beside it"),
 )
 _TOPICS = {
     topics.AXES_TOPIC: AxisBlock,
@@ -43,16 +45,19 @@ class RecorderNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("recorder", PARAMETERS)
+        self._bag: BagWriter | None = None
 
     def hardware_id(self) -> str:
         """Return the bag's path."""
-        return str(self.values.get("path", ""))
+        return str(self._bag.path) if self._bag else ""
 
     def configure(self, undo: ExitStack) -> None:
         """Open the bag."""
-        path = self.values["path"]
-        if not path.endswith(".mcap"):
-            raise ConfigurationError(f"path {path!r} must name an .mcap file")
+        path = Path(self.values["path"])
+        if path.suffix != ".mcap":
+            raise ConfigurationError(f"path {str(path)!r} must name an .mcap file")
+        if self.values["numbered"]:
+            path = next_free(path)
         self._names = {t: self.resolve_topic_name(t.rpartition("/")[2]) for t in _TOPICS}
         self._counts = dict.fromkeys(self._names.values(), 0)
         self._lost = dict.fromkeys(_TOPICS, 0)

@@ -14,6 +14,7 @@ from omsm_ros.core.samples import blocks
 from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.storage import bags, conversions
 from omsm_ros.storage.recording.bag_repair import repair
+from omsm_ros.storage.recording.bag_writer import next_free
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -113,6 +114,17 @@ def test_a_bag_that_exists_is_refused(cell):
         cell.wait("it to end", lambda: False)
     cell.processes._running.clear()
     assert path.read_bytes() == b"precious"
+
+
+def test_one_that_is_started_again_goes_on_beside_what_was_recorded(cell):
+    path = cell.folder / "scan.mcap"
+    path.write_bytes(b"precious")
+    cell.processes.start("recorder", path=str(path), numbered=True)
+    cell.wait("it", lambda: cell.operator.text("recorder", "lifecycle") == "active")
+    end(cell, signal.SIGINT)
+    assert path.read_bytes() == b"precious"
+    assert numbers_in(cell.folder / "scan.2.mcap") == []
+    assert next_free(path) == cell.folder / "scan.3.mcap"
 
 
 def test_at_the_limit_of_size_the_recorder_ends_and_says_so(cell):

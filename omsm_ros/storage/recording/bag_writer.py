@@ -201,6 +201,15 @@ def new_bag_file(path: Path) -> GrowingFile:
         raise _not_writable(path, err) from err
 
 
+def next_free(path: Path) -> Path:
+    """Return ``path``, or the first of path.2, path.3, … before its suffix that is not there."""
+    tried, number = path, 1
+    while os.path.lexists(tried):
+        number += 1
+        tried = path.with_name(f"{path.stem}.{number}{path.suffix}")
+    return tried
+
+
 def _exists(path: Path) -> BagError:
     return BagError(
         f"{str(path)!r} exists and is not overwritten; give another name, or move it away"
