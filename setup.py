@@ -63,8 +63,7 @@ setup(
     ],
     entry_points={
         "console_scripts": [
-            *(f"{node} = {PACKAGE}.nodes.{node}_node:main" for node in NODES),
-            f"replay = {PACKAGE}.nodes.player_node:main",
+            *(f"{node} = {PACKAGE}.nodes.start:main" for node in (*NODES, "replay")),
             f"omsm = {PACKAGE}.cli:main",
         ]
     },

@@ -93,6 +93,26 @@ def test_it_installs_every_command(wheel):
     }
 
 
+@pytest.mark.parametrize("absent", ["rclpy", "omsm_msgs"])
+def test_a_node_that_finds_no_ros_ends_in_one_line(installed, absent):
+    """Of ``pip install`` without ROS, and of ``ros2 run`` without the messages."""
+    program = (
+        f"import sys, types; sys.path.insert(0, {str(installed)!r})\n"
+        "sys.modules['rclpy'] = sys.modules['omsm_msgs'] = types.ModuleType('stand_in')\n"
+        f"sys.modules[{absent!r}] = None  # importing it fails\n"
+        "from omsm_ros.nodes import start\n"
+        "sys.argv = ['/usr/bin/corrector']\n"
+        "start.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"corrector: import of {absent} halted")
+    assert "make setup" in line
+
+
 def licence(package):
     """What a package says of its licence: expression, classifiers, or its first lines."""
     about = importlib.metadata.metadata(package)

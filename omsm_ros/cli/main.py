@@ -147,7 +147,7 @@ def _demo(args: argparse.Namespace) -> int:
     if args.experiment:
         return _experiment(args)
     # The demonstration runs real nodes, so it is one; ROS is imported only there.
-    command = [sys.executable, "-m", "omsm_ros.nodes.cell_demo_node", "--out", str(args.out)]
+    command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(args.out)]
     command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]
     command += ["--device", args.device]
     command += ["--disturbances", args.disturbances] if args.disturbances else []

@@ -1,0 +1,40 @@
+"""Where the command of every node begins; without ROS it ends there, in one line with the remedy.
+
+``pip install`` puts the commands of the nodes beside ``omsm``, and ``ros2 run`` finds them in a
+workspace whose messages were not built. ``python -m omsm_ros.nodes.start corrector …`` is the same.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+_BAD_INPUT = 2
+_OTHER_NAMES = {"replay": "player"}
+_NO_ROS = (
+    "ROS 2 Jazzy is not in this Python: source /opt/ros/jazzy/setup.bash, or '. ./env.sh' after "
+    "'make setup' in a checkout; the offline commands (omsm) need none"
+)
+_NO_MESSAGES = (
+    "the messages of omsm_ros are not built, or not sourced: 'colcon build --base-paths src "
+    "src/omsm_ros/msg_defs' and source install/setup.bash, or 'make setup' and '. ./env.sh'"
+)
+_NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
+
+
+def main() -> None:
+    """Run the node that the command is named for."""
+    name = Path(sys.argv[0]).stem
+    for package, remedy in _NEEDED.items():
+        try:
+            importlib.import_module(package)
+        except ImportError as err:
+            print(f"{name}: {err}: {remedy}", file=sys.stderr)
+            sys.exit(_BAD_INPUT)
+    importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node").main()
+
+
+if __name__ == "__main__":
+    del sys.argv[0]
+    main()
