@@ -46,8 +46,9 @@ PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
         "calibration_folders",
-        "",
-        "what load_calibration may read from, separated by ':'; empty = any folder",
+        "~:.",
+        "what load_calibration may read from, separated by ':'; ~ = home, . = where the node was "
+        "started; empty = any folder",
     ),
     Parameter("follow_calibrator", True, "take what appears on the topic calibration"),
     Parameter("settings", "{}", "JSON object of how the cell is set now; {} = not compared"),

@@ -30,7 +30,7 @@ from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import MessageInfo, listen
 from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.storage.calibration_file import load_calibration, load_for_others
 from omsm_ros.storage.calibration_folder import confined, since
 
 _STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
@@ -108,7 +108,7 @@ class CorrectorNode(ManagedNode):
     ) -> None:
         response.id = self._in_force_id()
         path = confined(Path(request.path), self.values["calibration_folders"])
-        calibration = await self._aside.do(partial(load_calibration, path))
+        calibration = await self._aside.do(partial(load_for_others, path))
         self._put_in_force(calibration, self._topic.decided())
         response.success, response.message = True, "in use"
         response.id = self._in_force_id()

@@ -55,7 +55,30 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read ``CAL.json``, or a set of them; CalibrationError if malformed, altered, implausible."""
-    text = read_text(path, MAX_CALIBRATION_BYTES, CalibrationError, "calibration")
+    return _calibration_in(_text_of(path), path)
+
+
+def load_for_others(path: Path | str) -> Calibration:
+    """Read ``CAL.json`` for who may not see the file; no error shows what stands in it.
+
+    Raises CalibrationError.
+    """
+    text = _text_of(path)
+    try:
+        return _calibration_in(text, path)
+    except CalibrationError:
+        # Without its cause, which would be in the log that everybody can subscribe to.
+        raise CalibrationError(
+            f"{str(path)!r} is there, but no calibration that can be used; on that computer, "
+            f"'omsm compare {str(path)!r} {str(path)!r}' tells why"
+        ) from None
+
+
+def _text_of(path: Path | str) -> str:
+    return read_text(path, MAX_CALIBRATION_BYTES, CalibrationError, "calibration")
+
+
+def _calibration_in(text: str, path: Path | str) -> Calibration:
     what = f"calibration {str(path)!r}"
     content = strict_json.object_of(text, CalibrationError, what)
     is_set = content.get("schema") == SET_SCHEMA

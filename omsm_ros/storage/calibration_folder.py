@@ -87,13 +87,14 @@ def since(path: Path) -> int:
 def confined(path: Path, folders: str) -> Path:
     """Return ``path`` resolved; CalibrationError unless it lies below one of ``folders``.
 
-    folders: separated by ":", as in PATH; empty = anywhere
+    folders: separated by ":", as in PATH; "~" is the home folder, "." the working directory;
+        empty = anywhere
     """
     try:
-        resolved = path.resolve()
+        resolved = path.expanduser().resolve()
+        allowed = [Path(each).expanduser().resolve() for each in folders.split(":") if each]
     except (OSError, ValueError, RuntimeError) as err:
         raise CalibrationError(f"no calibration at {str(path)[:200]!r}; check the path") from err
-    allowed = [Path(folder).resolve() for folder in folders.split(":") if folder]
     if allowed and not any(resolved.is_relative_to(folder) for folder in allowed):
         raise CalibrationError(
             f"{str(path)[:200]!r} lies outside the folders that calibrations are loaded from, "

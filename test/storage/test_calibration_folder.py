@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import traceback
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.errors import CalibrationError, FileError
-from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.storage.calibration_file import load_calibration, load_for_others, save_calibration
 from omsm_ros.storage.calibration_folder import CalibrationFolder, confined, since
 
 NOON_NS = 1_800_000_000_000_000_000
@@ -101,3 +102,44 @@ def test_what_lies_below_is_let_in(tmp_path: Path) -> None:
     file = tmp_path / "a" / "cal.json"
     assert confined(file, str(tmp_path)) == file
     assert confined(file, "") == file
+
+
+def test_by_default_it_is_the_home_folder_and_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("home", "here", "other"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path / "here")
+    assert confined(Path("~/cal.json"), "~:.") == tmp_path / "home" / "cal.json"
+    assert confined(Path("cal.json"), "~:.") == tmp_path / "here" / "cal.json"
+    with pytest.raises(CalibrationError, match="outside the folders"):
+        confined(tmp_path / "other" / "cal.json", "~:.")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"s3cret": 1}',
+        '["s3cret"]',
+        '"s3cret"',
+        "s3cret",
+        '{"schema": "s3cret"}',
+        '{"schema": "omsm-calibration/1", "id": "s3cret"}',
+    ],
+)
+def test_of_what_is_no_calibration_nothing_is_told_to_others(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "cal.json"
+    file.write_text(content)
+    with pytest.raises(CalibrationError, match="no calibration that can be used") as refused:
+        load_for_others(file)
+    assert "s3cret" not in "".join(traceback.format_exception(refused.value))
+    with pytest.raises(CalibrationError):
+        load_calibration(file)
+
+
+def test_a_calibration_is_loaded_for_others_too(
+    tmp_path: Path, true_calibration: Calibration
+) -> None:
+    save_calibration(tmp_path / "cal.json", true_calibration)
+    assert load_for_others(tmp_path / "cal.json").id == true_calibration.id

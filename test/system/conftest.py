@@ -122,8 +122,9 @@ class Cell:
 
 
 @pytest.fixture
-def cell(tmp_path):
-    """All that is started ends with the test."""
+def cell(tmp_path, monkeypatch):
+    """All that is started ends with the test; it is started in the test's folder."""
+    monkeypatch.chdir(tmp_path)
     from omsm_ros.nodes.processes import NodeProcesses
 
     with NodeProcesses(tmp_path / "log") as processes:

@@ -121,7 +121,7 @@ class Hour:
             (LoadCalibration, "corrector/load_calibration", {"path": "/dev/zero"}),
             (PredictError, "corrector/predict_error", {"z": [0.0] * 50, "sample_period": 1e300}),
             (Identify, "calibrator/identify", {"order": 99}),
-            (Identify, "calibrator/identify", {}),
+            (Identify, "calibrator/identify", {"duration": 1.0}),
         ):
             assert self.cell.call(kind, name, **fields).message
 
@@ -165,7 +165,12 @@ def strike(hour, faults, until):
     while hour.played < until:
         hour.pass_by(FAULT_PERIOD_S)
         next(faults)()
+        print(hour.played, memory(hour), flush=True)
     hour.pass_by(5.0)
+    return memory(hour)
+
+
+def memory(hour):
     return {node: resident_bytes(hour.cell.processes.pid(node)) for node in NODES}
 
 
