@@ -75,6 +75,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
     """Return what people read of a form."""
     removed, points = facts["removed"], facts["points"]
     rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
+    rows += [(f"{n} held", why) for n, why in removed["held"].items()]
     rows += [
         (f"{n} not fitted", f"{why}{dragged(facts, n)}")
         for n, why in removed["not_determined"].items()

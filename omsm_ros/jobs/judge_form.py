@@ -10,12 +10,12 @@ import numpy as np
 
 from omsm_ros.core.form.analyse import Form
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.surface.freedoms import MOVES
 from omsm_ros.core.surface.placement import FREEDOMS, Aperture
 from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
 from omsm_ros.storage.maps.vertex_file import write_ply
 
-_LIKE_FORM = ("x", "y", "clocking")
 _NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
 
 
@@ -65,6 +65,7 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
         "removed": {
             "fitted": list(found.freedoms.fitted),
             "not_determined": dict(found.freedoms.refused),
+            "held": dict(found.freedoms.held),
             "pose_uncertainty": {
                 source: dict(zip(found.freedoms.fitted, map(float, shares), strict=True))
                 for source, shares in found.from_source.items()
@@ -86,17 +87,24 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
 
 
 def _advice(form: Form) -> list[str]:
-    """What would say more, where the fit of a move leaves less of the form than it is sure of."""
-    moves = [n for n in form.registration.freedoms.fitted if n in _LIKE_FORM]
-    rms = form.deviation["rms"]
-    if not moves or rms.uncertainty is None or rms.value >= 2 * rms.uncertainty:
-        return []
-    names = " and ".join(moves)
-    return [
-        f"a move along {names} looks like form here, and was fitted, so that little is known of "
-        "form that looks so; if the part was not moved since it was cut, hold it: "
+    """What would say more, where a move leaves less of the form than it is sure of."""
+    freedoms, rms = form.registration.freedoms, form.deviation["rms"]
+    fitted = [n for n in freedoms.fitted if n in MOVES]
+    if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
+        fitted = []
+    told = [
+        f"a move along {' and '.join(fitted)} looks like form here, and was fitted, so that little "
+        "is known of form that looks so; if the part was not moved since it was cut, hold it: "
         "--fit piston,tip,tilt"
-    ]
+    ] * bool(fitted)
+    if freedoms.held:
+        others = ",".join(n for n in freedoms.fitted if n not in freedoms.held)
+        told.append(
+            f"{' and '.join(freedoms.held)} held as in the nominal pose, for form looks like a "
+            "move there; how far the part may be off all the same is in every uncertainty; if it "
+            f"is known to sit within a micrometre, name what to fit: --fit {others}"
+        )
+    return told
 
 
 def _curves(form: Form) -> dict[str, Any]:

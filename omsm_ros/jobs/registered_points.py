@@ -12,8 +12,9 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.core.surface.placement import Placed, Portion, freedom_columns, placed
-from omsm_ros.core.surface.registration import Registration, register
+from omsm_ros.core.surface.placement import Placed, Portion, placed
+from omsm_ros.core.surface.pose_budget import Registration
+from omsm_ros.core.surface.registration import register
 
 _PORTION = 65_536
 POSE = "pose of the part"
@@ -86,8 +87,7 @@ class _Followed:
         low = int(chosen[0]) if len(chosen) else 0
         rows = self.fields.at(low, int(chosen[-1]) - low + 1 if len(chosen) else 0)
         part = _slice(self.at_, first, count)
-        columns = freedom_columns(self.found.placement, part, self.found.freedoms.fitted)
-        return np.asarray(rows[:, chosen - low] * part.normal[2] + self.found.moved.T @ columns)
+        return self.found.effects(part, rows[:, chosen - low])[1][: len(rows)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +99,14 @@ class _OfPose:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (POSE,) * len(self.found.pose_effects)
+        return (POSE,) * (len(self.found.pose_effects) + len(self.found.held_effects))
 
     def at(self, first: int, count: int) -> FloatArray:
         """Fields (p, count) [m] of the kept points from ``first`` on."""
         part = _slice(self.at_, first, count)
-        columns = freedom_columns(self.found.placement, part, self.found.freedoms.fitted)
-        return np.asarray(self.found.pose_effects @ columns)
+        none = np.zeros((self.found.moved.shape[1] - len(self.found.held_effects), len(part.x)))
+        pose, sources = self.found.effects(part, none)
+        return np.concatenate([pose, sources[len(none) :]])
 
 
 def _slice(at: Placed, first: int, count: int) -> Placed:

@@ -24,6 +24,7 @@ def facts():
         "removed": {
             "fitted": ["tip", "y"],
             "not_determined": {"clocking": "it does what tip and y do"},
+            "held": {"x": "form looks like it here"},
             "pose_uncertainty": {
                 "noise and form": by_noise,
                 "dynamics": {"tip": 4e-6, "y": 0.0},
@@ -44,6 +45,10 @@ def test_what_goes_with_a_freedom_that_is_not_determined_is_told_apart(facts):
     told = rows["clocking not fitted"]
     assert told.startswith("it does what tip and y do; clocking ± 17 mrad would go with")
     assert told.endswith("tip ± 17 mrad, y ± 900 µm, at the same form")
+
+
+def test_a_freedom_that_was_held_is_told_with_the_reason(facts):
+    assert dict(form_rows(facts))["x held"] == "form looks like it here"
 
 
 def test_a_figure_that_may_be_nothing_is_told_as_a_bound(facts):

@@ -91,14 +91,22 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
     assert figures["rms_before_fit"]["value"] > 5e-6
 
 
-def test_with_a_free_pose_terms_carry_what_the_pose_may_have_taken(folder, tmp_path):
+def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(folder, tmp_path):
+    """The part was not moved: its terms are those of the truth, and how sure that is, is said."""
     _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
     found = json.loads(path.read_text())
-    assert found["removed"]["fitted"] == ["piston", "tip", "tilt", "x", "y"]
+    assert found["removed"]["fitted"] == ["piston", "tip", "tilt"]
+    assert set(found["removed"]["held"]) == {"x", "y"}
+    assert "nm rms of form" in found["removed"]["held"]["y"]
     assert "tip and y" in found["removed"]["not_determined"]["clocking"]
     for term in found["zernike"]:
         known = {(2, -2): ASTIGMATISM, (3, -1): COMA}.get((term["n"], term["m"]), 0.0)
-        assert abs(term["value"] - known) < 4 * term["uncertainty"] + 0.003 * known
+        assert abs(term["value"] - known) < 1.5e-9
+        if term["n"] == 2:
+            assert term["uncertainty"] > 5e-9
+    assert found["pose"]["x"]["value"] == 0
+    assert found["pose"]["x"]["uncertainty"] > 1e-6
+    assert any("--fit piston,tip,tilt" in note for note in found["removed"]["notes"])
     entry = found["pose"]["clocking"]
     assert entry["uncertainty"] == pytest.approx(np.pi / 180)
 

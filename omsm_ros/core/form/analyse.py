@@ -29,13 +29,12 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.placement import (
     Aperture,
     Placed,
-    Placement,
     Portion,
     Portions,
-    freedom_columns,
     placed,
 )
-from omsm_ros.core.surface.registration import CHUNK, Registration, register
+from omsm_ros.core.surface.pose_budget import Registration
+from omsm_ros.core.surface.registration import CHUNK, register
 from omsm_ros.core.surface.zernike_terms import first_terms
 from omsm_ros.errors import DataError
 
@@ -89,11 +88,14 @@ def analyse_form(
     Raises DataError for points that are too few, do not fit, or do not determine a freedom.
     """
     found = register(surface, portions, asked, sources=sources, aperture=aperture, even=even)
-    gathered = _Gathered(surface, found, aperture, len(sources))
+    gathered = _Gathered(surface, found, aperture)
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
-    map_ = gathered.map(found, even, [n for n, name in enumerate(sources) if name in bounds])
+    bounded = [n for n, name in enumerate(sources) if name in bounds]
+    # What is held may be where it should: how far off it is at most is all that is known.
+    bounded += range(len(sources), len(sources) + len(found.held_effects))
+    map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
     cells = Cells.of(map_)
@@ -134,11 +136,8 @@ def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> di
 class _Gathered:
     """The points in the part's frame, while they pass."""
 
-    def __init__(
-        self, surface: Surface, found: Registration, aperture: Aperture | None, sources: int
-    ) -> None:
+    def __init__(self, surface: Surface, found: Registration, aperture: Aperture | None) -> None:
         self._surface, self._found, self._aperture = surface, found, aperture
-        self._sources = sources
         self._kept = EvenSelection(MOST_WEIGHED)
         self._least, self._most = np.inf, -np.inf
         self._noise: list[float] = []
@@ -160,7 +159,7 @@ class _Gathered:
         good[chosen] = found.good(whole.part(chosen))
         self._count(finite, has_height, inside, good)
         if np.any(good):
-            self._keep(at, whole.part(good), portion.systematic[:, good])
+            self._keep(whole.part(good), portion.systematic[:, good])
 
     def _count(
         self, finite: BoolArray, has_height: BoolArray, inside: BoolArray, good: BoolArray
@@ -175,15 +174,12 @@ class _Gathered:
         ):
             self.counts[name] += int(np.count_nonzero(chosen))
 
-    def _keep(self, at: Placement, points: Placed, systematic: FloatArray) -> None:
+    def _keep(self, points: Placed, systematic: FloatArray) -> None:
         self._least = min(self._least, float(points.deviation.min()))
         self._most = max(self._most, float(points.deviation.max()))
         self._noise.append(noise_of(points.deviation))
-        names = self._found.freedoms.fitted
-        columns = freedom_columns(at, points, names)
-        pose = self._found.pose_effects @ columns
         # What a source does to the heights, and what the pose that follows it takes away again.
-        along = systematic * points.normal[2] + self._found.moved.T @ columns
+        pose, along = self._found.effects(points, systematic)
         rows = [points.x, points.y, points.deviation, *pose, *along]
         self._kept.add(np.stack(rows, axis=1))
 
@@ -209,5 +205,5 @@ class _Gathered:
             # Points need not come in the order of a path; then their neighbours are elsewhere.
             noise=min(float(np.median(self._noise)), noise_beside(*rows[:3]), found.noise),
             # The sources' effects stand behind those of the pose.
-            bounds=len(rows) - 3 - self._sources + np.array(bounds, np.int64),
+            bounds=len(found.pose_effects) + np.array(bounds, np.int64),
         )

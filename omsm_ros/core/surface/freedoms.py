@@ -14,10 +14,18 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.placement import FREEDOMS
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.readable import quantity
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 AUTO = "auto"
+HELD = "freedoms held"
+"""Name of the source of error that a freedom is which was held."""
 RIGID = FREEDOMS[:6]
+MOVES = ("x", "y", "clocking")
+"""Freedoms that a chuck settles; piston, tip and tilt no part comes without."""
+# Of its uncertainty: a part that is found so far off was moved. Less may be its form, the size of
+# which is itself found from few terms.
+_PLAINLY = 5.0
 _LEAST_FORM_M = NANOMETRE_M
 
 
@@ -32,10 +40,19 @@ def widest(freedom: str) -> float:
 
 
 class Freedoms(NamedTuple):
-    """What is fitted, in the order of its columns, and why something else is not."""
+    """What is fitted, in the order of its columns, and why something else is not.
+
+    refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest`
+    """
 
     fitted: tuple[str, ...]
     refused: dict[str, str]
+    held: dict[str, str]
+
+    def without(self, name: str, reason: str) -> Freedoms:
+        """Return the freedoms with one of them held."""
+        left = tuple(n for n in self.fitted if n != name)
+        return Freedoms(left, self.refused, {**self.held, name: reason})
 
 
 def parsed_freedoms(text: str) -> tuple[str, ...]:
@@ -74,7 +91,39 @@ def determined(asked: Sequence[str], gram: FloatArray, points: int) -> Freedoms:
             refused[name] = reason
         else:
             raise DataError(f"{name} cannot be fitted: {reason}; leave it out of the fit")
-    return Freedoms(tuple(fitted), refused)
+    return Freedoms(tuple(fitted), refused, {})
+
+
+def weakest(
+    names: Sequence[str], values: FloatArray, covariance: FloatArray, gram: FloatArray
+) -> tuple[str, str] | None:
+    """Return which move had better be held at its nominal value, and why; None if none had.
+
+    One that takes away no more form than its uncertainty leaves open says nothing of the part.
+
+    values: of ``names`` (p,) as they were found;  covariance: of these (p, p)
+    gram: mean products of what they do to the deviation (p, p)
+    """
+    spread = np.sqrt(np.diag(covariance))
+    scale = np.sqrt(np.diag(gram))
+    inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    # The part of its column that no other freedom has.
+    own = scale / np.sqrt(np.maximum(np.diag(inverse), 1.0))
+    found = [
+        (abs(values[k]) / spread[k], k)
+        for k, name in enumerate(names)
+        if name in MOVES and own[k] * spread[k] > _LEAST_FORM_M
+    ]
+    if not found or min(found)[0] > _PLAINLY:
+        return None
+    k = min(found)[1]
+    unit = "rad" if names[k] == "clocking" else "m"
+    return names[k], (
+        f"form looks like it here: the points tell it to {quantity(spread[k], unit, 2)} only, "
+        f"which is {quantity(own[k] * spread[k], 'm', 2)} rms of form, and do not show that the "
+        f"part was moved ({quantity(values[k], unit, 2)} was found); what that opens widens every "
+        "figure"
+    )
 
 
 def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> str:

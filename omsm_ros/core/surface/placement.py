@@ -15,8 +15,10 @@ import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.core.surface.slopes import gradient_of, unit_normal
+from omsm_ros.errors import DataError
 
 FREEDOMS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
@@ -139,3 +141,34 @@ def freedom_columns(placement: Placement, points: Placed, freedoms: Sequence[str
         else:
             columns[row] = -0.5 * (points.x**2 + points.y**2) * points.normal[2]
     return columns
+
+
+def selection(portions: Portions, most: int) -> Portion:
+    """Return ``most`` points evenly chosen from all, without their systematic effects."""
+    kept, count = EvenSelection(most), 0
+    for portion in portions():
+        kept.add(np.stack([portion.x, portion.y, portion.height], axis=1))
+        count += len(portion.x)
+    if not count:
+        raise DataError("0 points: there is nothing to register; check the cloud")
+    x, y, height = kept.rows().T
+    return Portion(x, y, height, np.empty((0, len(x))))
+
+
+def usable(points: Placed, aperture: Aperture | None) -> Placed:
+    """Return the points with a deviation that lie within the aperture."""
+    good = np.isfinite(points.deviation)
+    if aperture is not None:
+        good &= aperture.holds(points.x, points.y)
+    return points.part(good)
+
+
+def about_the_origin(points: Placed) -> Aperture:
+    """Return the disc about the part's origin that holds all points.
+
+    About their middle where the origin lies outside of them.
+    """
+    ends = [(float(v.min()), float(v.max())) for v in (points.x, points.y)]
+    inside = all(low < 0 < high for low, high in ends)
+    x, y = (0.0, 0.0) if inside else ((low + high) / 2 for low, high in ends)
+    return Aperture(float(np.hypot(points.x - x, points.y - y).max()) or 1.0, x, y)

@@ -10,35 +10,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples import scatter
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.form_model import (
     LEAST_LIMIT_M,
     Estimate,
     FormBasis,
+    NormalEquations,
     estimate,
     limit_of,
     most_like,
     relaxed,
 )
-from omsm_ros.core.surface.freedoms import Freedoms, determined, widest
-from omsm_ros.core.surface.normal_equations import NormalEquations
+from omsm_ros.core.surface.freedoms import AUTO, HELD, Freedoms, determined, weakest, widest
 from omsm_ros.core.surface.placement import (
     FREEDOMS,
     Aperture,
-    Placed,
     Placement,
     Portion,
     Portions,
+    about_the_origin,
     freedom_columns,
     placed,
+    selection,
+    usable,
 )
+from omsm_ros.core.surface.pose_budget import Open, Registration, root_of
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
 
@@ -50,51 +53,6 @@ _MOST_TURNS, _MOST_REFINED = 30, 30
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose stands when its last step moved no point by more than this share of their spread.
 _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Registration:
-    """How the part sits, and how well that is known.
-
-    placement: of the part;  freedoms: what was fitted, and what could not be
-    covariance: of the fitted ones, from noise, form and systematic sources (p, p)
-    from_source: standard uncertainty of each (p,) by where it comes from
-    pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
-    moved: by how much each systematic source, off by its uncertainty, moves the freedoms (p, s)
-    limit: deviation from the smooth form beyond which a point is an outlier [m]
-    disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
-    noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
-    """
-
-    placement: Placement
-    freedoms: Freedoms
-    covariance: FloatArray
-    from_source: dict[str, FloatArray]
-    pose_effects: FloatArray
-    moved: FloatArray
-    limit: float
-    disc: Aperture
-    basis: FormBasis
-    form: FloatArray
-    noise: float
-    before: float
-
-    def uncertainty(self, freedom: str) -> float | None:
-        """Return the standard uncertainty of a freedom, None if it was held.
-
-        One that the surface does not determine may be anything that a hand leaves it at.
-        """
-        if freedom in self.freedoms.refused:
-            return widest(freedom)
-        if freedom not in self.freedoms.fitted:
-            return None
-        place = self.freedoms.fitted.index(freedom)
-        return float(np.sqrt(self.covariance[place, place]))
-
-    def good(self, points: Placed) -> BoolArray:
-        """Return which points (n,) are no outliers."""
-        smooth = self.form @ self.basis.columns(points.x, points.y)
-        return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
 
 
 def register(
@@ -115,9 +73,9 @@ def register(
     Raises DataError for too few points, a freedom that the surface does not determine, or a fit
     that does not converge.
     """
-    chosen = _selection(portions)
+    chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
-    first = _usable(placed(surface, start, chosen), aperture)
+    first = usable(placed(surface, start, chosen), aperture)
     if len(first.x) < _LEAST_POINTS:
         raise DataError(
             f"{len(first.x)} points lie on the nominal surface, expected {_LEAST_POINTS} or more; "
@@ -126,44 +84,52 @@ def register(
     columns = freedom_columns(start, first, FREEDOMS)
     freedoms = determined(asked, columns @ columns.T, len(first.x))
     at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
-    points = _usable(placed(surface, at, chosen), aperture)
-    disc = aperture or _about_the_origin(points)
+    points = usable(placed(surface, at, chosen), aperture)
+    disc = aperture or about_the_origin(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
     fit = _Fit(surface, freedoms, aperture, basis)
-    at, like, limit = fit.refine(at, chosen)
-    unknown = fit.unknown(at, chosen)
-    return _over_all(fit, at, like, limit, portions, sources, unknown)
+    stand = fit.refine(at, chosen)
+    open_ = Open.of(fit.unknown(stand.at, chosen))
+    if AUTO in asked:
+        fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
+    return _over_all(fit, stand, portions, sources, open_)
 
 
-def _selection(portions: Portions) -> Portion:
-    """Return points evenly chosen from all, without their systematic effects."""
-    kept, count = EvenSelection(_MOST_SELECTED), 0
-    for portion in portions():
-        kept.add(np.stack([portion.x, portion.y, portion.height], axis=1))
-        count += len(portion.x)
-    if not count:
-        raise DataError("0 points: there is nothing to register; check the cloud")
-    x, y, height = kept.rows().T
-    return Portion(x, y, height, np.empty((0, len(x))))
-
-
-def _usable(points: Placed, aperture: Aperture | None) -> Placed:
-    """Return the points with a deviation that lie within the aperture."""
-    good = np.isfinite(points.deviation)
-    if aperture is not None:
-        good &= aperture.holds(points.x, points.y)
-    return points.part(good)
-
-
-def _about_the_origin(points: Placed) -> Aperture:
-    """Return the disc about the part's origin that holds all points.
-
-    About their middle where the origin lies outside of them.
+class _Stand(NamedTuple):
+    """at: the placement that stands;  like: what sum of columns is most like there (q,)
+    limit: of dust [m];  found, sums: by the selected points
     """
-    ends = [(float(v.min()), float(v.max())) for v in (points.x, points.y)]
-    inside = all(low < 0 < high for low, high in ends)
-    x, y = (0.0, 0.0) if inside else ((low + high) / 2 for low, high in ends)
-    return Aperture(float(np.hypot(points.x - x, points.y - y).max()) or 1.0, x, y)
+
+    at: Placement
+    like: FloatArray
+    limit: float
+    found: Estimate
+    sums: NormalEquations
+
+
+def _useful(
+    fit: _Fit, stand: _Stand, chosen: Portion, asked: Sequence[str], open_: Open
+) -> tuple[_Fit, _Stand, Open]:
+    """Hold, of what nobody asked for by name, what the points do not tell well enough."""
+    names, at = fit.names, stand.at
+    values = np.array([at.value(name) for name in names])
+    covariance = stand.found.covariance[: len(names), : len(names)]
+    while True:
+        free = len(fit.names)
+        weak = weakest(
+            tuple("" if n in asked else n for n in fit.names),
+            np.array([stand.at.value(n) for n in fit.names]),
+            stand.found.covariance[:free, :free],
+            stand.sums.gram[:free, :free] / stand.sums.points,
+        )
+        if weak is None:
+            break
+        fit = replace(fit, freedoms=fit.freedoms.without(*weak))
+        back = stand.at.moved([weak[0]], np.array([-stand.at.value(weak[0])]))
+        stand = fit.refine(_coarse(fit.surface, chosen, fit.names, fit.aperture, back), chosen)
+    held = [names.index(n) for n in fit.freedoms.held]
+    square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
+    return fit, stand, open_._replace(held=square)
 
 
 def _coarse(
@@ -175,7 +141,7 @@ def _coarse(
 ) -> Placement:
     """Return the placement of least squares, points far from the others left out."""
     for turn in range(_MOST_TURNS):
-        points = _usable(placed(surface, at, chosen), aperture)
+        points = usable(placed(surface, at, chosen), aperture)
         if turn:
             middle = points.deviation - np.median(points.deviation)
             # Generous: what is left here is still the pose.
@@ -212,8 +178,8 @@ class _Fit:
     def new_sums(self, sources: int) -> NormalEquations:
         return NormalEquations(len(self.names) + len(self.basis), sources)
 
-    def unknown(self, at: Placement, chosen: Portion) -> dict[str, FloatArray]:
-        """Return what each freedom that the surface does not determine does to the others (2, p).
+    def unknown(self, at: Placement, chosen: Portion) -> dict[str, dict[str, FloatArray]]:
+        """Return what each freedom that the surface does not determine does to the others (2,).
 
         They follow it along a curve: a surface without errors, in the pose found, is fitted once
         more where the freedom is off by as much as it may be to either side. Half the difference
@@ -224,21 +190,27 @@ class _Fit:
         few = few._replace(height=PosedSurface(self.surface, at.pose).height(few.x, few.y))
         few = Portion(*(v[..., np.isfinite(few.height)] for v in few))
         rigid = replace(at, power=0.0)
-        found = {}
+        found: dict[str, dict[str, FloatArray]] = {}
         for name in self.freedoms.refused:
             ends = [
                 _coarse(self.surface, few, self.names, None, rigid.moved([name], np.array([off])))
                 for off in (widest(name), -widest(name))
             ]
-            moves = [[e.value(n) - rigid.value(n) for n in self.names] for e in ends]
-            high, low = np.array(moves)
-            found[name] = np.stack([(high - low) / 2, (high + low) / 2])
+            found[name] = {}
+            for n in self.names:
+                high, low = (end.value(n) - rigid.value(n) for end in ends)
+                found[name][n] = np.array([(high - low) / 2, (high + low) / 2])
         return found
 
     def sums(
-        self, at: Placement, portion: Portion, like: FloatArray, limit: float, sums: NormalEquations
+        self,
+        stand: _Stand,
+        portion: Portion,
+        held_effects: FloatArray,
+        sums: NormalEquations,
     ) -> None:
-        """Add a portion's points to ``sums``, residuals from the sum ``like`` of columns."""
+        """Add a portion's points to ``sums``, residuals from what is most like them."""
+        at, like, limit = stand.at, stand.like, stand.limit
         for begin in range(0, len(portion.x), CHUNK):
             part = Portion(*(v[..., begin : begin + CHUNK] for v in portion))
             whole = placed(self.surface, at, part)
@@ -246,7 +218,10 @@ class _Fit:
             if self.aperture is not None:
                 good &= self.aperture.holds(whole.x, whole.y)
             points = whole.part(good)
-            systematic = part.systematic[:, good] * points.normal[2]
+            held = freedom_columns(at, points, tuple(self.freedoms.held))
+            systematic = np.concatenate(
+                [part.systematic[:, good] * points.normal[2], held_effects @ held]
+            )
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-freedom_columns(at, points, self.names), z])
             residual = points.deviation - like @ columns
@@ -265,14 +240,14 @@ class _Fit:
         found = estimate(square, moments, variance * max(together, 1.0), largest, self.basis.group)
         return found, variance
 
-    def refine(self, at: Placement, chosen: Portion) -> tuple[Placement, FloatArray, float]:
-        """Return the placement that stands, what columns are most like there, and the dust's limit.
+    def refine(self, at: Placement, chosen: Portion) -> _Stand:
+        """Return the placement that stands.
 
         Raises DataError if none does.
         """
         share, last = 1.0, np.zeros(len(self.names))
         for turn in range(_MOST_REFINED):
-            points = _usable(placed(self.surface, at, chosen), self.aperture)
+            points = usable(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-freedom_columns(at, points, self.names), z])
             like, limit = most_like(columns, points.deviation)
@@ -287,7 +262,8 @@ class _Fit:
             settled = max(_SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
             if turn > 3 and float(np.max(np.abs(step))) < settled:
                 smooth = np.concatenate([found.step, found.form]) @ columns
-                return at, like, limit_of(points.deviation - smooth)
+                limit = limit_of(points.deviation - smooth)
+                return _Stand(at, like, limit, found, sums)
             share, last = relaxed(share, last, step), step
             at = at.moved(self.names, share * found.step)
         raise DataError(
@@ -297,20 +273,14 @@ class _Fit:
 
 
 def _over_all(
-    fit: _Fit,
-    at: Placement,
-    like: FloatArray,
-    limit: float,
-    portions: Portions,
-    sources: Sequence[str],
-    unknown: dict[str, FloatArray],
+    fit: _Fit, stand: _Stand, portions: Portions, sources: Sequence[str], open_: Open
 ) -> Registration:
     """Return the registration by all points, from one pass over them at a pose that stands."""
-    free = len(fit.names)
-    sums = fit.new_sums(len(sources))
+    free, held = len(fit.names), root_of(open_.held)
+    sums = fit.new_sums(len(sources) + len(held))
     square = points = 0.0
     for portion in portions():
-        fit.sums(at, portion, like, limit, sums)
+        fit.sums(stand, portion, held, sums)
         before = placed(fit.surface, Placement(), portion).deviation
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))
@@ -319,29 +289,19 @@ def _over_all(
     # A source that is off by its standard uncertainty moves the pose by one of these columns.
     moved = gain @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
-    by_source = {"noise and form": np.sqrt(np.diag(covariance))}
-    for k, name in enumerate(sources):  # of one source there may be several independent effects
-        by_source[name] = np.hypot(by_source.get(name, 0.0), moved[:, k])
-    by_source |= {name: np.sqrt(np.sum(moves**2, axis=0)) for name, moves in unknown.items()}
-    together = np.vstack([moved.T, *unknown.values()])
+    by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * len(held)), moved)
     return Registration(
-        placement=at.moved(fit.names, found.step),
+        placement=stand.at.moved(fit.names, found.step),
         freedoms=fit.freedoms,
-        covariance=covariance + together.T @ together,
         from_source=by_source,
-        pose_effects=_root(covariance),
+        pose_effects=root_of(covariance),
+        held_effects=held,
         moved=moved,
-        limit=limit,
+        spread=open_.spread(fit.freedoms, by_source),
+        limit=stand.limit,
         disc=fit.basis.disc,
         basis=fit.basis,
         form=found.form,
         noise=float(np.sqrt(variance)),
         before=float(np.sqrt(square / max(points, 1.0))),
     )
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Return rows (p, p) whose outer products add up to the covariance."""
-    scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray((np.sqrt(np.maximum(values, 0.0)) * vectors).T * scale, np.float64)

@@ -77,6 +77,10 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
     for name in part(form, "removed", "fitted") or ():
         pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
         rows.append((name, _size(pose.get("value"), unit), _size(settled(form, name), unit)))
+    held: Mapping[str, str] = part(form, "removed", "held") or {}
+    for name, why in held.items():
+        spread = part(form, "pose", name, "uncertainty")
+        rows.append((f"not {name}", f"held: {why}", _size(spread, _POSE_UNITS[name])))
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
     rows += [
         (f"not {name}", f"{why}{dragged(form, name)}", NOTHING) for name, why in refused.items()

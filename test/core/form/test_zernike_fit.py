@@ -33,13 +33,30 @@ def test_it_is_the_least_squares_of_the_whole_matrix(weighted):
 
 
 def test_the_uncertainty_is_the_scatter():
-    """White noise: 40 draws tell a standard deviation to 11 %, 37 terms together to 2 %."""
+    """White noise: 24 draws tell a standard deviation to 14 %, 37 terms together to 2.4 %."""
     off = []
-    for seed in range(40):
-        x, y, rng = scattered(20_000, seed)
+    for seed in range(24):
+        x, y, rng = scattered(10_000, seed)
         found = fit_zernikes(x, y, rng.normal(0, 1e-8, len(x)), TERMS, DISC)
         off.append(found.coefficients / found.uncertainty)
-    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.06)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.08)
+
+
+def test_on_a_spiral_the_stated_variance_is_not_too_small():
+    """Of white noise its value is known. The fit follows the few groups of successive points at
+    the rim, and their residuals alone would state 7 % too little, 17 % of symmetric terms."""
+    radius, angle = np.linspace(12.7e-3, 0, 20_000), np.linspace(0, 200 * np.pi, 20_000)
+    x, y = radius * np.cos(angle) + DISC.x, radius * np.sin(angle) + DISC.y
+    columns = zernike_values(*DISC.scaled(x, y), TERMS)
+    inverse = np.linalg.inv((columns * radius) @ columns.T)
+    true = np.diag(inverse @ ((columns * radius**2) @ columns.T) @ inverse)
+    stated = [
+        np.diag(fit_zernikes(x, y, noise, TERMS, DISC, weights=radius).covariance) / true
+        for noise in np.random.default_rng(4).normal(0, 1, (12, len(x)))
+    ]
+    assert 0.98 < np.mean(stated) < 1.3
+    symmetric = [k for k, term in enumerate(TERMS) if term.m == 0]
+    assert np.mean(np.array(stated)[:, symmetric]) > 0.93
 
 
 def test_errors_that_hang_together_count_as_such():

@@ -188,6 +188,42 @@ def test_what_is_not_determined_widens_what_follows_it():
     assert held.uncertainty("clocking") is None
 
 
+ASTIGMATIC = ZernikeSurface(RADIUS, (0, 0, 0, 0, 35e-9, 35e-9, 10e-9, -11e-9))
+
+
+def test_a_move_that_form_looks_like_is_held_and_may_do_what_is_stated():
+    """A part that sits 3 µm beside its place: some 10 nm of form, which nobody can tell."""
+    pose = Pose(x=3e-6, y=-2e-6, tip=1e-3)
+    found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC), pose))
+    assert set(found.freedoms.held) == {"x", "y"}
+    assert "do not show that the part was moved" in found.freedoms.held["x"]
+    for name in ("x", "y"):
+        assert found.placement.value(name) == 0
+        assert abs(getattr(pose, name)) < 2 * found.uncertainty(name)
+    # By as much as the heights of a part without errors change when it is moved so.
+    there = scan(PAPER_MIRROR, pose, noise=0.0)
+    points = placed(PAPER_MIRROR, Placement(), there)
+    names = ("piston", "tip", "tilt")
+    columns = freedom_columns(Placement(), points, names).T
+    left = points.deviation - columns @ np.linalg.lstsq(columns, points.deviation, rcond=None)[0]
+    opened = found.effects(points, np.empty((0, len(there.x))))[1]
+    assert opened.shape == (2, len(there.x))
+    assert np.sqrt(np.mean(left**2)) < 2 * np.sqrt(np.mean(np.sum(opened**2, axis=0)))
+
+
+def test_a_part_that_was_plainly_moved_is_fitted_there():
+    pose = Pose(x=4e-4, y=-3e-4, tip=1e-3)
+    found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC), pose))
+    assert set(found.freedoms.fitted) >= {"x", "y"}
+    assert not found.freedoms.held
+
+
+def test_what_was_asked_for_by_name_is_never_held():
+    found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC)), "piston,tip,tilt,x,y")
+    assert found.freedoms.fitted == ("piston", "tip", "tilt", "x", "y")
+    assert found.held_effects.shape == (0, 0)
+
+
 def test_dust_is_left_out():
     clean, dusty = (
         fitted(PAPER_MIRROR, scan(PAPER_MIRROR, POSE, dust=d), "piston,tip,tilt,x,y")

@@ -1,0 +1,120 @@
+"""How well is it known how the part sits, and what does that do to its form?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.surface.form_model import FormBasis
+from omsm_ros.core.surface.freedoms import Freedoms, widest
+from omsm_ros.core.surface.placement import Aperture, Placed, Placement, freedom_columns
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Registration:
+    """How the part sits, and how well that is known.
+
+    placement: of the part;  freedoms: what was fitted, and what could not be
+    from_source: standard uncertainty of each (p,) by where it comes from
+    pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
+    held_effects: the same of those that are held (h, h), as far as the points bound them
+    moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
+        then by how much what is held does (p, s + h)
+    spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
+    limit: deviation from the smooth form beyond which a point is an outlier [m]
+    disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
+    noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
+    """
+
+    placement: Placement
+    freedoms: Freedoms
+    from_source: dict[str, FloatArray]
+    pose_effects: FloatArray
+    held_effects: FloatArray
+    moved: FloatArray
+    spread: dict[str, float]
+    limit: float
+    disc: Aperture
+    basis: FormBasis
+    form: FloatArray
+    noise: float
+    before: float
+
+    def uncertainty(self, freedom: str) -> float | None:
+        """Return the standard uncertainty of a freedom, None if nobody asked for it."""
+        return self.spread.get(freedom)
+
+    def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the pose (p, n) and the sources (s + h, n) may do to the deviations [m].
+
+        systematic: effects on the heights (s, n), which the pose then follows. The last h of the
+        sources are the freedoms that were held.
+        """
+        columns = freedom_columns(self.placement, points, self.freedoms.fitted)
+        held = self.held_effects @ freedom_columns(
+            self.placement, points, tuple(self.freedoms.held)
+        )
+        sources = np.concatenate([systematic * points.normal[2], held])
+        return self.pose_effects @ columns, sources + self.moved.T @ columns
+
+    def good(self, points: Placed) -> BoolArray:
+        """Return which points (n,) are no outliers."""
+        smooth = self.form @ self.basis.columns(points.x, points.y)
+        return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
+
+
+class Open(NamedTuple):
+    """What is not in the covariance of the fit.
+
+    unknown: by freedom that no surface determines: what it does to each of the others, in first
+        and second order
+    held: mean products of what was held and what the points tell of it (h, h)
+    """
+
+    unknown: dict[str, dict[str, FloatArray]]
+    held: FloatArray
+
+    @classmethod
+    def of(cls, unknown: dict[str, dict[str, FloatArray]]) -> Open:
+        """Return what is open where nothing is held."""
+        return cls(unknown, np.empty((0, 0)))
+
+    def by_source(
+        self,
+        names: Sequence[str],
+        covariance: FloatArray,
+        sources: Sequence[str],
+        moved: FloatArray,
+    ) -> dict[str, FloatArray]:
+        """Return the standard uncertainties (p,) of the fitted ``names`` by where they come from.
+
+        covariance: by noise and form (p, p);  moved: by each of the ``sources`` (p, s), of which
+            several may have one name
+        """
+        found = {"noise and form": np.sqrt(np.diag(covariance))}
+        for k, name in enumerate(sources):
+            found[name] = np.hypot(found.get(name, 0.0), moved[:, k])
+        for name, dragged in self.unknown.items():
+            found[name] = np.array([np.linalg.norm(dragged[n]) for n in names])
+        return found
+
+    def spread(self, freedoms: Freedoms, by_source: dict[str, FloatArray]) -> dict[str, float]:
+        """Return the standard uncertainty of each freedom that was asked for."""
+        held = np.sqrt(np.diag(self.held))
+        fitted = np.sqrt(np.sum([s**2 for s in by_source.values()], axis=0))
+        found = dict(zip(freedoms.fitted, map(float, fitted), strict=True))
+        for name, own in zip(freedoms.held, held, strict=True):
+            dragged = [np.linalg.norm(moves[name]) for moves in self.unknown.values()]
+            found[name] = float(np.linalg.norm([own, *dragged]))
+        return found | {name: widest(name) for name in freedoms.refused}
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return rows (p, p) whose outer products add up to the covariance."""
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray((np.sqrt(np.maximum(values, 0.0)) * vectors).T * scale, np.float64)
