@@ -11,7 +11,7 @@ Pereyra 1973, with Kaufman's simplification of the derivative).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -130,16 +130,19 @@ class Problem:
         return np.asarray(back[..., : len(self.input)][..., self.used], np.float64)
 
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
-        """Residual and its derivative by ψ after the linear parameters are eliminated."""
+        """Residual at one ψ after the linear parameters are eliminated."""
         lag, relative = scaled.lag(nonlinear, self.s)
         driven = self._driven(scaled.structure, lag)
         columns = np.column_stack([self._in_time(driven).T, self._fixed])
         basis, triangle = np.linalg.qr(columns)
         linear = least_squares(triangle, basis.T @ self._target, _RANK_TOLERANCE)
         residual = self._target - columns @ linear
-        moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
-        jacobian = basis @ (basis.T @ moved) - moved
-        return Projection(residual, jacobian, linear)
+
+        def derivative() -> FloatArray:
+            moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
+            return np.asarray(basis @ (basis.T @ moved) - moved)
+
+        return Projection(nonlinear, residual, linear, derivative)
 
     def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
         """Spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
@@ -199,11 +202,22 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """At one ψ: residual (k,), jacobian (k, len ψ), linear parameters (m + 1 + q,)."""
+    """At one ψ, ``nonlinear``: residual (k,), linear parameters (m + 1 + q,)."""
 
+    nonlinear: FloatArray
     residual: FloatArray
-    jacobian: FloatArray
     linear: FloatArray
+    derivative: Callable[[], FloatArray]
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivative of the residual by ψ, (k, len ψ); where no step starts, none is needed."""
+        return self.derivative()
+
+    @cached_property
+    def normal_equations(self) -> tuple[FloatArray, FloatArray]:
+        """Return half the slope of the sum of squares (len ψ,) and its curvature."""
+        return self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,50 +275,39 @@ class Fit:
         return self.scaled.transfer_function(self.nonlinear, self.numerator)
 
 
-class _Cache:
-    """Residual and jacobian of one ψ come from the same transform; compute it once."""
-
-    def __init__(self, problem: Problem, scaled: Scaled) -> None:
-        self._problem, self._scaled = problem, scaled
-        self._at: FloatArray | None = None
-        self._value: Projection | None = None
-
-    def at(self, nonlinear: FloatArray) -> Projection:
-        if self._value is None or self._at is None or not np.array_equal(nonlinear, self._at):
-            self._value = self._problem.project(self._scaled, nonlinear)
-            self._at = nonlinear.copy()
-        return self._value
-
-
 def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
     """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them."""
     scaled = problem.parametrised(structure)
-    cache = _Cache(problem, scaled)
-    best, best_cost = starts[0], np.inf
+    best, least = None, np.inf
     for start in starts:
-        nonlinear = _descend(cache, scaled, start, _RACE_EVALUATIONS) if len(start) else start
-        cost = float(np.sum(cache.at(nonlinear).residual ** 2))
-        if cost < best_cost:
-            best, best_cost = nonlinear, cost
-    if len(best):
-        best = _descend(cache, scaled, best, _FINISH_EVALUATIONS)
-    at = cache.at(best)
+        found = _descend(
+            problem, scaled, problem.project(scaled, _inside(scaled, start)), _RACE_EVALUATIONS
+        )
+        cost = float(np.sum(found.residual**2))
+        if best is None or cost < least:
+            best, least = found, cost
+    if best is None:
+        raise ValueError("no start to fit from, expected one or more")
+    at = _descend(problem, scaled, best, _FINISH_EVALUATIONS)
     terms = len(at.linear) - problem.background.shape[1]
-    return Fit(scaled, best, at.linear[:terms], at.linear[terms:], at.residual)
+    return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)
 
 
-def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int) -> FloatArray:
+def _descend(problem: Problem, scaled: Scaled, start: Projection, evaluations: int) -> Projection:
     """Levenberg and Marquardt's way downhill inside the box, damped after Nielsen (1999).
 
     On normal equations: a handful of parameters against many samples, whose scale is taken
     out. A general solver factorises the whole jacobian at each step, and takes ten times as long.
     """
+    at = start
+    if not len(at.nonlinear):
+        return at
     lower, upper = scaled.bounds()
-    nonlinear = np.clip(start, lower, upper)
-    at, damping, growth = cache.at(nonlinear), _FIRST_DAMPING, 2.0
+    damping, growth = _FIRST_DAMPING, 2.0
     cost = float(at.residual @ at.residual)
     for _ in range(evaluations):
-        slope, curvature = at.jacobian.T @ at.residual, at.jacobian.T @ at.jacobian
+        nonlinear = at.nonlinear
+        slope, curvature = at.normal_equations
         # A parameter at its bound that would leave the box stays.
         free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
         scale = np.sqrt(np.diag(curvature))
@@ -312,22 +315,26 @@ def _descend(cache: _Cache, scaled: Scaled, start: FloatArray, evaluations: int)
         if not np.any(free):
             break
         step = _damped_step(curvature, slope, scale, free, damping)
-        trial = np.clip(nonlinear + step, lower, upper)
-        tried = cache.at(trial)
+        tried = problem.project(scaled, np.clip(nonlinear + step, lower, upper))
         new_cost = float(tried.residual @ tried.residual)
         if not new_cost < cost:
-            if np.all(np.abs(trial - nonlinear) <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
+            moved = np.abs(tried.nonlinear - nonlinear)
+            if np.all(moved <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
                 break
             damping, growth = damping * growth, growth * 2
             continue
         gained, promised = cost - new_cost, -float(step @ (2 * slope + curvature @ step))
-        nonlinear, at, cost = trial, tried, new_cost
+        at, cost = tried, new_cost
         ratio = gained / promised if promised > 0 else 1.0
         damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
         # χ² that changes by less than this is converged.
         if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
             break
-    return nonlinear
+    return at
+
+
+def _inside(scaled: Scaled, start: FloatArray) -> FloatArray:
+    return np.clip(start, *scaled.bounds())
 
 
 def _damped_step(
