@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.protocols.chrocodile_telegram import (
-    FLOAT,
     FORMATS,
     MAX_TELEGRAM_BYTES,
     SAMPLE_COUNTER,
@@ -156,6 +156,7 @@ class LineDecoder:
         self._layout = layout
         self._dtype = layout.dtype
         self._line = re.compile(rb"(?: +%s){%d} *\r?" % (_NUMBER, len(layout.signals)))
+        self._limits = _limits(layout)
         self._tail = b""
         self._synchronised = False
         self._received = self._kept = self._telegrams = self._losses = 0
@@ -169,15 +170,22 @@ class LineDecoder:
         """Telegrams completed by ``data``, shape (n,); n may be 0."""
         self._received += len(data)
         *lines, tail = (self._tail + data).split(b"\n")
+        good = [line for line in lines if self._well_formed(line)]
+        shape = len(good), len(self._layout.signals)
+        values = np.fromstring(b" ".join(good), sep=" ").reshape(shape)
+        fits = self._fitting(values)
+        values = values[fits]
+        if lines:
+            # Before the first line's end is known, what precedes it may be half a line.
+            whole = bool(good and fits[0] and good[0] is lines[0])
+            self._losses += len(lines) - len(values) - (not (self._synchronised or whole))
+            self._synchronised = True
+        self._kept += sum(len(line) + 1 for line, fit in zip(good, fits, strict=True) if fit)
+        self._telegrams += len(values)
         if len(tail) > MAX_TELEGRAM_BYTES:
             tail, self._synchronised = b"", False
         self._tail = tail
-        rows = [row for line in lines if (row := self._row(line)) is not None]
-        self._telegrams += len(rows)
-        made = self._layout.records(len(rows))
-        for number, column in zip(self._layout.signals, zip(*rows, strict=True), strict=False):
-            made[str(number)] = column
-        return made
+        return self._records(values)
 
     def settle(self) -> Records:
         """Nothing: a line tells its end by itself; shape (0,)."""
@@ -193,28 +201,25 @@ class LineDecoder:
             losses_of_sync=self._losses,
         )
 
-    def _row(self, line: bytes) -> tuple[float, ...] | None:
-        row = self._values(line)
-        if row is None:
-            self._losses += self._synchronised
-            self._synchronised = True  # the next line begins after this one's end
-            return None
-        self._synchronised = True
-        self._kept += len(line) + 1
-        return row
+    def _well_formed(self, line: bytes) -> bool:
+        return len(line) <= MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
 
-    def _values(self, line: bytes) -> tuple[float, ...] | None:
-        if len(line) > MAX_TELEGRAM_BYTES or not self._line.fullmatch(line):
-            return None
-        row = tuple(map(float, line.split()))
-        for value, kind in zip(row, self._layout.types, strict=True):
-            if not _fits(value, kind):
-                return None
-        return row
+    def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Which rows of ``values`` (n, signals) their types can hold, shape (n,)."""
+        lowest, highest, whole = self._limits
+        inside = (values >= lowest) & (values <= highest)
+        return np.asarray((inside & (~whole | (values == np.rint(values)))).all(axis=1))
+
+    def _records(self, values: FloatArray) -> Records:
+        made = self._layout.records(len(values))
+        for number, column in zip(self._layout.signals, values.T, strict=True):
+            made[str(number)] = column
+        return made
 
 
-def _fits(value: float, kind: int) -> bool:
-    if kind == FLOAT:
-        return abs(value) <= float(np.finfo(np.float32).max)
-    limits = np.iinfo(FORMATS[kind])
-    return limits.min <= value <= limits.max and value == int(value)
+def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Lowest and highest value of each signal (signals,), and whether it is a whole number."""
+    kinds = [np.dtype(FORMATS[kind]) for kind in layout.types]
+    ranges = [np.finfo(kind) if kind.kind == "f" else np.iinfo(kind) for kind in kinds]
+    lowest, highest = ([float(getattr(r, end)) for r in ranges] for end in ("min", "max"))
+    return np.array(lowest), np.array(highest), np.array([kind.kind != "f" for kind in kinds])

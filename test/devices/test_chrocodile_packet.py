@@ -7,8 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from omsm_ros.devices.chrocodile import ChrocodileSettings
 from omsm_ros.devices.chrocodile_packet import ChrocodilePacketDevice
@@ -85,27 +83,6 @@ def test_it_is_back_within_five_seconds(cell: Any, fault: str) -> None:
     assert bool(found.restarts) == (
         fault in ("power cycle", "restart with the line up", "counter reset")
     )
-
-
-@pytest.mark.soak
-@settings(
-    max_examples=20,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(st.lists(st.tuples(st.sampled_from(sorted(FAULTS)), st.floats(0, 1.5)), max_size=6))
-def test_whatever_happens_in_any_order(bench: Any, story: list[tuple[str, float]]) -> None:
-    run = bench(ChrocodilePacketEmulator, ChrocodilePacketDevice, SIX, interval=0.02)
-    run.run(0.5)
-    for fault, pause in story:
-        FAULTS[fault](run.instrument)
-        run.run(pause)
-    run.run(8.0)
-    before = run.delivered
-    run.run(1.0)
-    assert run.delivered >= before + 900, run.troubles
-    run.end()
-    run.check()
 
 
 def test_a_refusal_is_named(cell: Any) -> None:

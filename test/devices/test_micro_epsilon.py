@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from omsm_ros.devices.capancdt import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.devices.confocaldt import (
@@ -253,23 +251,3 @@ def test_a_channel_it_does_not_have_is_named(bench: Any) -> None:
 def test_senseless_settings_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(ConfigurationError):
         make()
-
-
-@settings(
-    max_examples=15,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(st.lists(st.tuples(st.sampled_from(sorted(FAULTS)), st.floats(0, 1.5)), max_size=6))
-def test_whatever_happens_in_any_order(bench: Any, story: list[tuple[str, float]]) -> None:
-    run = ethernet(bench, interval=0.02)
-    run.run(0.5)
-    for fault, pause in story:
-        FAULTS[fault](run.instrument)
-        run.run(pause)
-    run.run(8.0)
-    before = run.delivered
-    run.run(1.0)
-    assert run.delivered >= before + 900, run.troubles
-    run.end()
-    run.check()
