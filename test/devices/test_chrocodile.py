@@ -163,7 +163,7 @@ def test_an_unplugged_cable_costs_exactly_what_was_measured_meanwhile(cell: Any)
     run.run(4.0)
     run.end()
     run.check()
-    assert 1900 < run.device.statistics.lost < 3000
+    assert 1900 < run.device.statistics.lost < 4000  # it tries again 1.75 s, then 3.75 s after
     assert run.device.statistics.gaps == 1
 
 
