@@ -36,6 +36,7 @@ setup(
         "test": ["pytest", "pytest-timeout", "hypothesis"],  # colcon test: use pytest
         "formats": [
             "h5py",
+            "npTDMS",
             "x3pio>=2; python_version >= '3.11'",
             "SurfaceTopography>=1.20",
         ],

@@ -67,6 +67,7 @@ ONLY_IN = {
     "websockets": {"viewing"},
     "matplotlib": {"report"},
     "h5py": {"storage"},
+    "nptdms": {"storage.foreign"},
     "x3pio": {"storage.maps"},
     "SurfaceTopography": {"storage.maps"},
 }

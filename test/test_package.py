@@ -31,6 +31,7 @@ ROSDEP = {
 # Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.
 OPTIONAL = {
     "h5py": "formats",
+    "nptdms": "formats",
     "distributed": "campaign",
     "pyads": "devices",
     "websockets": "viewer",

@@ -35,16 +35,19 @@ def _show_import(facts: Facts) -> None:
             ("invalid", "readings of the probe are none"),
             ("lost", "rows have an axis that is no number"),
             ("repeated_names", "lines repeat the line of names"),
+            ("passed_over", "messages hold none of the columns"),
         ):
             if file[count]:
                 print(f"    {file[count]} {meaning}")
+    if any(file["own_clock"] for file in facts["files"]):
+        print("probe and axes have clocks of their own: correct with --by-stamps")
     print(f"written: {facts['bag']}; look at it with 'omsm inspect'")
 
 
 COMMANDS = [
     Command(
         "import",
-        "make a bag of CSV, NumPy, MATLAB or HDF5 files",
+        "make a bag of CSV, NumPy, MATLAB, HDF5 or TDMS files, or of foreign ROS topics",
         _declare_import,
         _import,
         _show_import,

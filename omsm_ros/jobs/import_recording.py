@@ -3,37 +3,43 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.samples.foreign_columns import (
     AXES,
     COUNTING,
+    DATE,
+    MOST_PERIOD_ERROR,
     PROBE,
     ColumnMap,
+    Rows,
     axis_blocks,
-    counter_of_times,
-    counter_of_triggers,
     distance_blocks,
-    period_of,
+    in_step,
 )
 from omsm_ros.errors import FileError
+from omsm_ros.jobs.foreign_rows import Origin, RowCounter
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
-from omsm_ros.storage.foreign_tables import ForeignTable, TextForm
+from omsm_ros.storage.foreign.open_tables import open_tables
+from omsm_ros.storage.foreign.table import ForeignTable, TableForm, stated_unit
 from omsm_ros.storage.recording.bag_writer import whole_bag
 
 
 @dataclass(slots=True)
 class ImportedFile:
-    """What came out of one file.
+    """What came out of one file, or of one topic of a bag.
 
     missing: trigger numbers that it skips;  invalid: readings of the probe that are none
     lost: rows where an axis is no number;  repeated_names: lines that repeat the line of names
+    passed_over: messages that hold none of the columns
+    own_clock: whether it shares no trigger with the others, only time
     """
 
     file: str
@@ -45,12 +51,14 @@ class ImportedFile:
     invalid: int = 0
     lost: int = 0
     repeated_names: int = 0
+    passed_over: int = 0
+    own_clock: bool = False
 
 
 def import_recording(
     files: Sequence[Path],
     mapped: ColumnMap,
-    written: TextForm,
+    written: TableForm,
     out: Path,
     progress: Progress = no_progress,
 ) -> list[ImportedFile]:
@@ -60,17 +68,29 @@ def import_recording(
     side by side, row by row, or by their columns of trigger numbers or time. Raises FileError and
     DataError for what is missing or unclear; the bag then does not appear.
     """
-    sources = [_Source(ForeignTable(path, written), mapped) for path in files]
+    with ExitStack() as opened:
+        sources = []
+        for path in files:
+            for table in open_tables(path, written, mapped.names((*AXES, *PROBE))):
+                opened.callback(table.close)
+                sources.append(_Source(table, mapped))
+        _import(sources, mapped, out, progress)
+        return [source.found for source in sources]
+
+
+def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: Progress) -> None:
     chains: dict[tuple[str, ...], list[_Source]] = {}
     for source in sources:
         chains.setdefault(source.channels, []).append(source)
     _check_streams(list(chains), mapped)
+    streams = [_Stream(chain, mapped) for chain in chains.values()]
+    _align(streams, mapped)
     topics = [bags.AXES_TOPIC] * any("z" in c for c in chains)
     topics += [bags.DISTANCE_TOPIC] * any("distance" in c for c in chains)
     done = 0
     with whole_bag(out, topics) as bag:
         # By time, as they would have been recorded, so that no reader has to keep one back.
-        merged = heapq.merge(*map(_continued, chains.values()), key=lambda block: block.stamp_ns)
+        merged = heapq.merge(*(s.blocks() for s in streams), key=lambda block: block.stamp_ns)
         for block in merged:
             if isinstance(block, AxisBlock):
                 bag.write_axes(block)
@@ -78,7 +98,6 @@ def import_recording(
                 bag.write_distance(block)
             done += len(block)
             progress(done, 0)
-    return [source.found for source in sources]
 
 
 def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
@@ -95,86 +114,118 @@ def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
             )
 
 
-def _continued(sources: Iterable[_Source]) -> Iterator[AxisBlock | DistanceBlock]:
-    last: tuple[float, int] | None = None
-    for source in sources:
-        yield from source.blocks(last)
-        last = source.last
+class _Stream:
+    """Files of the same columns, one after the other, and the count of their rows."""
+
+    def __init__(self, sources: Sequence[_Source], mapped: ColumnMap) -> None:
+        self.sources = sources
+        channels = sources[0].channels
+        self.triggered = "trigger" in channels
+        self.counter = RowCounter(mapped, "time" in channels, self.triggered)
+        self.begins, self.period = self.counter.begin(sources[0].first())
+
+    def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
+        """Yield the blocks of all files."""
+        for source in self.sources:
+            yield from source.blocks(self.counter)
+
+
+def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
+    """Begin the count of all streams together, where their times do not forbid it."""
+    begun = [s.begins for s in streams if s.begins is not None]
+    if not begun:
+        return
+    epoch = min(begun)
+    start = epoch if mapped.dated else mapped.start
+    counted = len(begun) < len(streams) or any(s.triggered for s in streams)
+    together = counted or in_step(begun, [s.period for s in streams])
+    for stream in streams:
+        own = stream.begins is not None and not together
+        stream.counter.origin = Origin(start, epoch, stream.begins if own else epoch)
+        for source in stream.sources:
+            source.found.own_clock = own
 
 
 class _Source:
-    """One file, and how far it was read."""
+    """One table, and how far it was read."""
 
     def __init__(self, table: ForeignTable, mapped: ColumnMap) -> None:
         self._table, self._mapped = table, mapped
+        self._last: int | None = None
         wanted = [c for c in (*AXES, *PROBE, *COUNTING) if mapped.has(c)]
         self.channels = tuple(c for c in wanted if table.names.count(mapped.columns[c].name) == 1)
         streams = {*self.channels} - {*COUNTING}
-        if not streams:
-            wanted_names = [mapped.columns[c].name for c in wanted]
-            raise FileError(
-                f"{table} has none of the columns {wanted_names}, but {table.names[:20]}; "
-                "name the columns as its line of names does, each once"
-            )
-        self.last: tuple[float, int] | None = None
         axes, probe = streams & {*AXES}, "distance" in streams
-        self.found = ImportedFile(str(table.path), axes=bool(axes), distance=probe)
+        self.found = ImportedFile(table.label, axes=bool(axes), distance=probe)
         lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
         if lacking:
             raise FileError(
                 f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together and "
                 "come from one file"
             )
+        self._check_units()
+        self._check_period()
 
-    def blocks(self, before: tuple[float, int] | None) -> Iterator[AxisBlock | DistanceBlock]:
-        """Yield the file's blocks; ``before``: time [s] and number of the row before its first."""
-        self.last = before
-        names = self._mapped.names(self.channels)
-        for piece in self._table.pieces(list(dict.fromkeys(names))):
-            counter = self._counted(piece)
-            yield from self._made(piece, counter)
-        self.found.repeated_names = self._table.repeated_names
-        if not self.found.rows:
-            raise FileError(f"{self._table} has no row of numbers; check that it was written")
+    def _check_period(self) -> None:
+        stated, told = self._table.sample_period, self._mapped.sample_period
+        if stated and told and abs(told / stated - 1) > MOST_PERIOD_ERROR:
+            raise FileError(
+                f"{self._table} states a sample period of {stated:g} s, the map {told:g} s; "
+                "correct the map"
+            )
+
+    def _check_units(self) -> None:
+        """What the file itself says of a unit is not overruled in silence."""
+        for channel in self.channels:
+            column = self._mapped.columns[channel]
+            stated = stated_unit(self._table, column.name)
+            if column.contradicts(stated, channel):
+                raise FileError(
+                    f"{self._table} has {column.name!r} in {stated}, the map in {column.unit}; "
+                    f"correct the map, or, if the file is wrong, write unit: count and count: what "
+                    "one is in SI"
+                )
+
+    def first(self) -> Mapping[str, FloatArray]:
+        """Return the first rows; FileError where there are none."""
+        for piece in self._pieces():
+            return piece
+        raise FileError(f"{self._table} has no row of numbers; check that it was written")
+
+    def blocks(self, counter: RowCounter) -> Iterator[AxisBlock | DistanceBlock]:
+        """Yield the file's blocks; ``counter`` goes on from the file before."""
+        found = self.found
+        for piece in self._pieces():
+            rows = counter.count(piece)
+            skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
+            self._last = int(rows.counter[-1])
+            found.missing += int(np.sum(skipped))
+            found.rows += len(rows.counter)
+            found.sample_period = rows.period
+            yield from self._made(piece, rows)
+        found.repeated_names = self._table.repeated_names
+        found.passed_over = self._table.passed_over
+
+    def _number(self, rows: Rows) -> int:
+        """Trigger number before those of ``rows``."""
+        return int(rows.counter[0]) - 1 if self._last is None else self._last
 
     def _made(
-        self, piece: dict[str, FloatArray], counter: IntArray
+        self, piece: Mapping[str, FloatArray], rows: Rows
     ) -> Iterator[AxisBlock | DistanceBlock]:
         found = self.found
-        period = found.sample_period
         if found.axes:
-            for block in axis_blocks(piece, self._mapped, counter, period):
+            for block in axis_blocks(piece, self._mapped, rows):
                 finite = [np.isfinite(v) for v in (block.x, block.y, block.z, block.b, block.c)]
                 found.lost += int(np.sum(~np.all(finite, axis=0)))
                 yield block
         if found.distance:
-            for reading in distance_blocks(piece, self._mapped, counter, period):
+            for reading in distance_blocks(piece, self._mapped, rows):
                 found.invalid += int(np.sum(~reading.ok))
                 yield reading
 
-    def _counted(self, piece: dict[str, FloatArray]) -> IntArray:
-        """Trigger number of each row: from its column, from time, or row by row."""
-        columns, found = self._mapped.columns, self.found
-        rows = len(next(iter(piece.values())))
-        number = -1 if self.last is None else self.last[1]
-        times = piece[columns["time"].name] * columns["time"].factor if self._has("time") else None
-        if times is not None and not found.sample_period:
-            found.sample_period = period_of(times, self._mapped.sample_period)
-        if not found.sample_period:
-            if self._mapped.sample_period is None:
-                raise FileError(f"{self._table} has no column of time; give sample_period")
-            found.sample_period = self._mapped.sample_period
-        if self._has("trigger"):
-            counter = counter_of_triggers(piece[columns["trigger"].name], number)
-        elif times is not None:
-            counter = counter_of_times(times, found.sample_period, self.last)
-        else:
-            counter = np.arange(number + 1, number + 1 + rows)
-        first = int(counter[0]) if not found.rows else number + 1
-        found.rows += rows
-        found.missing += int(counter[-1]) + 1 - first - rows
-        self.last = (float(times[-1]) if times is not None else 0.0, int(counter[-1]))
-        return counter
-
-    def _has(self, channel: str) -> bool:
-        return channel in self.channels
+    def _pieces(self) -> Iterator[dict[str, FloatArray]]:
+        names = list(dict.fromkeys(self._mapped.names(self.channels)))
+        time = self._mapped.columns.get("time")
+        dates = [n for n in names if time is not None and time.unit == DATE and n == time.name]
+        return self._table.pieces(names, dates)

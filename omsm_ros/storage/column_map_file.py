@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ from omsm_ros.errors import DataError, FileError
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text
-from omsm_ros.storage.foreign_tables import TextForm
+from omsm_ros.storage.foreign.table import TableForm
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 
 _MAX_BYTES = 100_000
+_BY_PLACE = re.compile(r"\[\d{1,4}\]")
 
 _TEXT = {"type": "string", "minLength": 1}
 _LINES = {"type": "integer", "minimum": 0, "maximum": 1000}
@@ -26,9 +28,10 @@ _MAP = form(
         "columns": form(dict.fromkeys(CHANNELS, _COLUMN), ()),
         "sample_period": NUMBER,
         "start": NUMBER,
-        "invalid": {"type": "array", "items": NUMBER, "maxItems": 100},
+        "invalid": {"type": "array", "items": {"anyOf": [NUMBER, _TEXT]}, "maxItems": 100},
         "delimiter": {"type": "string", "minLength": 1, "maxLength": 1},
         "decimal": {"enum": [".", ","]},
+        "zone": {"type": "string", "pattern": r"^(Z|[+-]\d\d:\d\d)$"},
         "lines_before_names": _LINES,
         "lines_after_names": _LINES,
     },
@@ -36,26 +39,30 @@ _MAP = form(
 )
 
 
-def load_column_map(path: Path | str) -> tuple[ColumnMap, TextForm]:
+def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
     """Read ``MAP.yaml``; FileError for anything that is unclear, a unit above all."""
     what = f"map {str(path)!r}"
     text = read_text(path, _MAX_BYTES, FileError, "map")
     content = strict_yaml.mapping_of(text, FileError, what)
     check_form(content, _MAP, FileError, what)
+    invalid = content.get("invalid", ())
     try:
         mapped = ColumnMap(
             {c: _column(c, given) for c, given in content["columns"].items()},
             content.get("sample_period"),
             float(content.get("start", 0.0)),
-            tuple(float(value) for value in content.get("invalid", ())),
+            tuple(float(value) for value in invalid if not isinstance(value, str)),
         )
     except DataError as err:
         raise FileError(f"{what}: {err}") from err
-    written = TextForm(
+    written = TableForm(
         content.get("delimiter", ","),
         content.get("decimal", "."),
         content.get("lines_before_names", 0),
         content.get("lines_after_names", 0),
+        _is_named(mapped),
+        tuple(text for text in invalid if isinstance(text, str)),
+        content.get("zone", ""),
     )
     if written.delimiter == written.decimal:
         raise FileError(
@@ -65,6 +72,12 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TextForm]:
     return mapped, written
 
 
+def _is_named(mapped: ColumnMap) -> bool:
+    """Whether columns have names; where all are called [0], [1], … a text has no line of them."""
+    names = mapped.names(CHANNELS)
+    return not names or not all(_BY_PLACE.fullmatch(name) for name in names)
+
+
 def _column(channel: str, given: Mapping[str, Any]) -> Column:
     if ("name" in given) == ("constant" in given):
         raise DataError(f"{channel} needs a column's name, or a constant; give one of them")
@@ -72,7 +85,7 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
     if "constant" in given:
         constant = SIGNAL.checked(float(given["constant"]), DataError, f"{channel}: constant")
         return Column("", constant=constant and constant * _factor(channel, given, sign))
-    return Column(given["name"], _factor(channel, given, sign))
+    return Column(given["name"], _factor(channel, given, sign), unit=given.get("unit", ""))
 
 
 def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from types import MappingProxyType
@@ -44,12 +44,18 @@ _TIMES = {
     "µs": MICROSECOND_S,
     "ns": NANOSECOND_S,
 }
+DATE = "date"
+"""The unit of instants that are no numbers in the file: dates in text, stamps of messages."""
+
+UNIX = "unix"
+"""The unit of times in seconds since 1970."""
+
 UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         **dict.fromkeys(("x", "y", "z", "distance"), _LENGTHS),
         **dict.fromkeys(("b", "c"), _ANGLES),
         "intensity": {"1": 1.0, "%": 0.01},
-        "time": _TIMES,
+        "time": {**_TIMES, UNIX: 1.0, DATE: 1.0},
         "trigger": {"1": 1.0},
     }
 )
@@ -59,10 +65,14 @@ COUNT = "count"
 """The unit of a raw reading: a column in it says what one count is in SI."""
 
 _BLOCK_SAMPLES = 10_000
+_NOT_RISING = (
+    "import the parts before and after it one by one, or, if time is told too coarsely, leave it "
+    "out and state sample_period"
+)
 # A time that is off by more lies nearer to no sample than to its neighbour.
 _MOST_JITTER = 0.25
 # Clocks of two devices differ by less than 0.1 %; a period written wrongly by more.
-_MOST_PERIOD_ERROR = 1e-3
+MOST_PERIOD_ERROR = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +81,19 @@ class Column:
 
     name: of the column in the file; empty for a channel that stood still
     factor: SI value of one unit of it, with the sign that makes it ours
-    constant: its value [SI] where it has no column
+    constant: its value [SI] where it has no column;  unit: as the map names it
     """
 
     name: str
     factor: float = 1.0
     constant: float = 0.0
+    unit: str = ""
+
+    def contradicts(self, stated: str, channel: str) -> bool:
+        """Return whether ``stated``, a file's own word on the unit, means another one."""
+        units = UNITS[channel]
+        known = stated in units and self.unit in units
+        return known and units[stated] != units[self.unit]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +119,10 @@ class ColumnMap:
         if self.sample_period is not None:
             SAMPLE_PERIOD.checked(self.sample_period, DataError, "sample_period")
         STAMP.checked(round(self.start * NANOSECONDS_PER_S), DataError, "start")
+        if self.start and self.dated:
+            raise DataError(
+                f"start is {self.start:g} s, but the column of time holds dates; leave start out"
+            )
         if not {"z", "distance"} & set(self.columns):
             raise DataError("neither z nor distance has a column; there is nothing to import")
         lacking = [a for a in AXES if a not in self.columns]
@@ -111,6 +132,11 @@ class ColumnMap:
                 f"{lacking[0]}: {{constant: 0.0}}"
             )
 
+    @property
+    def dated(self) -> bool:
+        """Return whether the column of time tells instants since 1970."""
+        return "time" in self.columns and self.columns["time"].unit in (DATE, UNIX)
+
     def names(self, channels: tuple[str, ...]) -> list[str]:
         """Return the columns of the file that ``channels`` need, without those that stand still."""
         return [self.columns[c].name for c in channels if c in self.columns and self.has(c)]
@@ -118,6 +144,17 @@ class ColumnMap:
     def has(self, channel: str) -> bool:
         """Return whether ``channel`` is read from a column."""
         return channel in self.columns and self.columns[channel].name != ""
+
+
+def in_step(starts: Sequence[float], periods: Sequence[float]) -> bool:
+    """Return whether streams that begin at ``starts`` [s] share one trigger, by their times.
+
+    They do if their ``periods`` [s] agree to 0.1 %, and their samples fall on one grid.
+    """
+    period, first = periods[0], min(starts)
+    alike = all(abs(other / period - 1) < MOST_PERIOD_ERROR for other in periods)
+    places = [(start - first) / period for start in starts]
+    return alike and all(abs(place - round(place)) <= _MOST_JITTER for place in places)
 
 
 def period_of(times: FloatArray, stated: float | None) -> float:
@@ -132,15 +169,15 @@ def period_of(times: FloatArray, stated: float | None) -> float:
     if not np.all(steps > 0):
         row = int(np.argmax(steps <= 0)) + 1
         raise DataError(
-            f"time falls from {times[row - 1]:.9g} s to {times[row]:.9g} s at row {row}; "
-            "import the parts before and after it one by one"
+            f"time does not rise from {times[row - 1]:.15g} s to {times[row]:.15g} s at row {row}; "
+            f"{_NOT_RISING}"
         )
     found = float(np.median(steps))
     whole = np.maximum(np.round(steps / found), 1.0)
     found = float((times[-1] - times[0]) / np.sum(whole))
     if stated is None:
         return float(SAMPLE_PERIOD.checked(found, DataError, "sample period of the column time"))
-    if abs(found / stated - 1) > _MOST_PERIOD_ERROR:
+    if abs(found / stated - 1) > MOST_PERIOD_ERROR:
         raise DataError(
             f"sample_period is {stated:g} s, but the column of time says {found:.6g} s; "
             "correct the one that is wrong, or its unit"
@@ -165,14 +202,13 @@ def counter_of_times(
     if np.max(off, initial=0.0) > _MOST_JITTER:
         row = int(np.argmax(off))
         raise DataError(
-            f"time {times[row]:.9g} s comes {steps[row]:.3g} periods of {period:g} s after the one "
-            "before; give a column of trigger numbers, or samples taken evenly"
+            f"time {times[row]:.15g} s comes {steps[row]:.3g} periods of {period:g} s after the "
+            "row before; give a column of trigger numbers, or samples taken evenly; or, where only "
+            "the stamping is uneven, leave time out and state sample_period"
         )
     if np.min(whole, initial=1.0) < 1:
         row = int(np.argmin(whole))
-        raise DataError(
-            f"time {times[row]:.9g} s does not rise; import the parts before and after it apart"
-        )
+        raise DataError(f"time {times[row]:.15g} s does not rise; {_NOT_RISING}")
     return np.asarray(number + np.cumsum(whole).astype(np.int64))
 
 
@@ -193,38 +229,64 @@ def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
     return counter
 
 
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Where some rows stand in their recording.
+
+    counter: trigger number of each (n,);  elapsed: time of each (n,) [s] after ``start`` [s, Unix]
+    period: from trigger to trigger [s]
+    """
+
+    counter: IntArray
+    elapsed: FloatArray
+    period: float
+    start: float
+
+    def parts(self) -> Iterator[tuple[slice, int, int]]:
+        """Yield runs of consecutive numbers, no longer than a block: rows, stamp [ns], number."""
+        edges = [0, *(np.flatnonzero(np.diff(self.counter) != 1) + 1).tolist(), len(self.counter)]
+        # Apart, for a float of seconds since 1970 ends at a quarter of a microsecond.
+        whole, fraction = divmod(self.start, 1.0)
+        for begin, end in pairwise(edges):
+            for low in range(begin, end, _BLOCK_SAMPLES):
+                elapsed = round((fraction + float(self.elapsed[low])) * NANOSECONDS_PER_S)
+                stamp_ns = int(whole) * NANOSECONDS_PER_S + elapsed
+                yield slice(low, min(low + _BLOCK_SAMPLES, end)), stamp_ns, int(self.counter[low])
+
+
 def axis_blocks(
-    table: Mapping[str, FloatArray], mapped: ColumnMap, counter: IntArray, period: float
+    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: Rows
 ) -> Iterator[AxisBlock]:
-    """Yield the axes of rows ``table`` (column name → (n,)), cut at gaps of ``counter`` (n,)."""
-    channels = {c: _channel(table, mapped.columns[c], len(counter)) for c in AXES}
-    for part, stamp_ns, first in _parts(counter, mapped.start, period):
+    """Yield the axes of ``rows`` of ``table`` (column name → (n,)), cut at gaps of their count."""
+    channels = {c: _channel(table, mapped.columns[c], len(rows.counter)) for c in AXES}
+    for part, stamp_ns, first in rows.parts():
         yield AxisBlock(
             stamp_ns=stamp_ns,
             first_sample=first,
-            sample_period=period,
+            sample_period=rows.period,
             **{c: values[part] for c, values in channels.items()},
         )
 
 
 def distance_blocks(
-    table: Mapping[str, FloatArray], mapped: ColumnMap, counter: IntArray, period: float
+    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: Rows
 ) -> Iterator[DistanceBlock]:
-    """Yield the probe's readings of rows ``table``; NaN and ``invalid`` ones as no target."""
+    """Yield the probe's readings of ``rows``; NaN and ``invalid`` ones as no target."""
+    count = len(rows.counter)
     column = mapped.columns["distance"]
-    raw = table[column.name] if column.name else np.full(len(counter), column.constant)
-    distance = _channel(table, column, len(counter))
+    raw = table[column.name] if column.name else np.full(count, column.constant)
+    distance = _channel(table, column, count)
     lost = ~np.isfinite(distance) | np.isin(raw, np.asarray(mapped.invalid))
     distance = np.where(lost, np.nan, distance)
     status = np.where(lost, Status.NO_TARGET, Status.OK).astype(np.uint8)
     intensity = np.empty(0, np.float32)
     if mapped.has("intensity"):
-        intensity = _channel(table, mapped.columns["intensity"], len(counter)).astype(np.float32)
-    for part, stamp_ns, first in _parts(counter, mapped.start, period):
+        intensity = _channel(table, mapped.columns["intensity"], count).astype(np.float32)
+    for part, stamp_ns, first in rows.parts():
         yield DistanceBlock(
             stamp_ns=stamp_ns,
             first_sample=first,
-            sample_period=period,
+            sample_period=rows.period,
             distance=distance[part],
             intensity=intensity[part] if len(intensity) else intensity,
             status=status[part],
@@ -235,16 +297,3 @@ def _channel(table: Mapping[str, FloatArray], column: Column, rows: int) -> Floa
     if not column.name:
         return np.full(rows, column.constant)
     return np.asarray(table[column.name] * column.factor)
-
-
-def _parts(counter: IntArray, start: float, period: float) -> Iterator[tuple[slice, int, int]]:
-    """Runs of consecutive numbers, none longer than a block: rows, stamp [ns], first number."""
-    edges = [0, *(np.flatnonzero(np.diff(counter) != 1) + 1).tolist(), len(counter)]
-    for begin, end in pairwise(edges):
-        for low in range(begin, end, _BLOCK_SAMPLES):
-            first = int(counter[low])
-            # Apart, for a float of seconds since 1970 ends at a quarter of a microsecond.
-            whole, fraction = divmod(start, 1.0)
-            elapsed = round((fraction + first * period) * NANOSECONDS_PER_S)
-            stamp_ns = int(whole) * NANOSECONDS_PER_S + elapsed
-            yield slice(low, min(low + _BLOCK_SAMPLES, end)), stamp_ns, first

@@ -1,0 +1,121 @@
+"""Tables in files of arrays: NumPy, MATLAB, HDF5.
+
+A column of a table is named ``dataset[3]``, counted from 0; a plain array's columns are ``[0]``,
+``[1]`` and so on.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import FileError
+from omsm_ros.storage.files import open_regular, said
+from omsm_ros.storage.foreign.table import PIECE_ROWS, ForeignTable
+
+# What is loaded whole: NumPy's and MATLAB's own files.
+_MAX_WHOLE_BYTES = 4_000_000_000
+_MAX_COLUMNS = 1000
+
+_INDEXED = re.compile(r"(.*)\[(\d{1,4})\]")
+
+
+class ArrayTable(ForeignTable):
+    """The arrays of one file, of one dimension or two."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        read = {
+            ".npy": self._numpy, ".npz": self._numpy, ".mat": self._matlab,
+            ".h5": self._hdf5, ".hdf5": self._hdf5,
+        }[path.suffix.lower()]  # fmt: skip
+        with open_regular(path, FileError, "table") as stream:
+            size = stream.seek(0, io.SEEK_END)
+        if size > _MAX_WHOLE_BYTES and read != self._hdf5:
+            raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
+        try:
+            self._arrays = read()
+        except FileError:
+            raise
+        except Exception as err:  # whatever a library says of a damaged file
+            raise FileError(
+                f"{self} cannot be read: {said(err)}; write it again, or as CSV"
+            ) from err
+        for name, array in self._arrays.items():
+            self._name(name, array)
+
+    def _name(self, name: str, array: Any) -> None:
+        if array.dtype.kind not in "fiu":
+            return
+        if array.ndim == 1:
+            self.names.append(name)
+        elif array.ndim == 2:
+            columns = range(min(array.shape[1], _MAX_COLUMNS))
+            self.names += [f"{name}[{column}]" for column in columns]
+
+    def _numpy(self) -> Mapping[str, Any]:
+        with open_regular(self.path, FileError, "table") as stream:
+            loaded = np.load(stream)  # no pickles, by default
+            if isinstance(loaded, np.ndarray):
+                return {"": loaded}
+            return {name: loaded[name] for name in loaded.files}
+
+    def _matlab(self) -> Mapping[str, Any]:
+        from scipy.io import loadmat
+
+        with open_regular(self.path, FileError, "table") as stream:
+            if stream.read(10) == b"MATLAB 7.3":  # which is HDF5 under another name
+                return self._hdf5()
+        loaded = loadmat(self.path, squeeze_me=True, mat_dtype=True)
+        return {name: v for name, v in loaded.items() if isinstance(v, np.ndarray)}
+
+    def _hdf5(self) -> Mapping[str, Any]:
+        try:
+            import h5py
+        except ImportError as err:
+            raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
+        found: dict[str, Any] = {}
+        file = self._opened.enter_context(h5py.File(self.path, "r"))
+
+        def keep(name: str, item: object) -> None:
+            if isinstance(item, h5py.Dataset):
+                # MATLAB writes a column of numbers as a table of one row.
+                row = item.ndim == 2 and item.shape[0] == 1
+                found[name] = item[0] if row else item
+                stated = item.attrs.get("units", item.attrs.get("unit"))
+                if isinstance(stated, str):
+                    self.units[name] = stated
+
+        file.visititems(keep)
+        return found
+
+    def _pieces(
+        self, names: Sequence[str], dates: frozenset[str]
+    ) -> Iterator[dict[str, FloatArray]]:
+        if dates:
+            raise FileError(
+                f"{self} has numbers, no dates, in {sorted(dates)}; give them another unit"
+            )
+        views = {name: self._view(name) for name in names}
+        lengths = {name: len(array) for name, (array, _) in views.items()}
+        if len(set(lengths.values())) > 1:
+            raise FileError(f"{self} has columns of different lengths {lengths}; cut them alike")
+        for low in range(0, lengths[names[0]], PIECE_ROWS):
+            rows = slice(low, low + PIECE_ROWS)
+            yield {
+                name: np.asarray(array[rows] if column is None else array[rows, column], np.float64)
+                for name, (array, column) in views.items()
+            }
+
+    def _view(self, name: str) -> tuple[Any, int | None]:
+        if name in self._arrays:
+            return self._arrays[name], None
+        indexed = _INDEXED.fullmatch(name)
+        assert indexed is not None  # it is one of self.names
+        return self._arrays[indexed[1]], int(indexed[2])

@@ -1,0 +1,202 @@
+"""Text as loggers, controls and spreadsheets write it: read rightly, or refused in one line."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.errors import OmsmError
+
+PROBE = "sample_period: 0.001\ncolumns:\n  distance: {name: d, unit: um}\n"
+DATED = "columns:\n  time: {name: t, unit: date}\n  distance: {name: d, unit: um}\n"
+
+
+@pytest.fixture
+def read(importer):
+    """Distances [µm] of a text under a map."""
+
+    def distances(text, mapping=PROBE, encoding="utf-8"):
+        data = text if isinstance(text, bytes) else text.encode(encoding)
+        (importer.folder / "a.csv").write_bytes(data)
+        importer.found = importer(mapping, "a.csv")[0]
+        return np.concatenate([b.distance for b in importer.blocks()]) * 1e6
+
+    distances.importer = importer
+    return distances
+
+
+def refusal(read, *given):
+    """The one line that says what is wrong; no bag appears."""
+    with pytest.raises(OmsmError) as caught:
+        read(*given)
+    assert not read.importer.out.exists()
+    said = str(caught.value)
+    assert "\n" not in said
+    return said
+
+
+# --------------------------------------------------------------------------------- read rightly
+
+
+@pytest.mark.parametrize(
+    ("text", "more"),
+    [
+        ("i,d\r\n0,1.5\r\n1,-2\r\n", ""),
+        ("i,d\r0,1.5\r1,-2\r", ""),
+        ("i\td\n0\t1.5\n1\t-2\n", 'delimiter: "\\t"\n'),
+        ("i|d\n0|1.5\n1|-2", "delimiter: '|'\n"),
+        ("   i      d\n   0    1.5\n   1   -2\n", "delimiter: ' '\n"),
+        ('"i","d"\n"0","1.5"\n"1","-2"\n', ""),
+        ("i,d,\n0,1.5,\n1,-2,\n", ""),
+        ("i,d\n0,1.5,\n1,-2,\n", ""),
+        ("i,d\n0,15E-1\n1,-0.2e+01\n", ""),
+        ("i;d\n0;1,5\n1;-2,0\n", 'delimiter: ";"\ndecimal: ","\n'),
+        ('i,d\n0,"1,5"\n1,"-2,0"\n'.replace(",", ";").replace("1;5", "1,5").replace("2;0", "2,0"),
+         'delimiter: ";"\ndecimal: ","\n'),
+        ("\n\n i , d \n0,1.5\n\n1,-2\n\n", ""),
+        ('sep=,\ni,d\n0,1.5\n1,-2\n', "lines_before_names: 1\n"),
+        ('"t, s",d\n0,1.5\n1,-2\n', ""),
+        ("\td\n0\t1.5\n1\t-2\n", 'delimiter: "\\t"\n'),
+    ],
+    ids=[
+        "Windows", "old Mac", "tabs", "bars", "blanks", "quotes", "delimiters at the ends",
+        "delimiters below the names", "powers of ten", "German", "German in quotes", "blank lines",
+        "Excel's separator", "a delimiter in a name", "an unnamed first column",
+    ],
+)  # fmt: skip
+def test_the_same_two_numbers_however_they_are_written(read, text, more):
+    assert read(text, PROBE + more) == pytest.approx([1.5, -2.0])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_a_name_with_a_mu_in_any_encoding(read, encoding):
+    mapping = "sample_period: 0.001\ncolumns:\n  distance: {name: 'gap [µm]', unit: µm}\n"
+    assert read("gap [µm]\n1.5\n-2\n", mapping, encoding) == pytest.approx([1.5, -2.0])
+
+
+def test_a_text_without_names_is_read_by_place(read):
+    mapping = "sample_period: 0.001\ncolumns:\n  distance: {name: '[1]', unit: um}\n"
+    assert read("7,1.5\n8,-2\n", mapping) == pytest.approx([1.5, -2.0])
+
+
+def test_words_for_no_reading_are_stated_and_counted(read):
+    mapping = PROBE + "invalid: ['---', OVR]\n"
+    values = read("i,d\n0,1\n1,---\n2,ovr\n3,4\n", mapping)
+    assert np.isnan(values).tolist() == [False, True, True, False]
+    assert read.importer.found.invalid == 2
+
+
+def test_infinite_readings_are_none(read):
+    assert np.isnan(read("d\n1\ninf\n-inf\n")).tolist() == [False, True, True]
+
+
+def test_dates_count_the_samples_and_set_the_clock(read):
+    rows = [f"2026-11-21T14:03:{5 + i // 100:02d}.{i % 100:02d}0+01:00,{i}" for i in range(300)]
+    del rows[100:120]
+    values = read("\n".join(["t,d", *rows]), DATED)
+    assert len(values) == 280
+    assert read.importer.found.missing == 20
+    assert read.importer.found.sample_period == pytest.approx(0.01)
+    block = read.importer.blocks()[0]
+    expected = np.datetime64("2026-11-21T13:03:05", "ns").astype(np.int64)
+    assert abs(block.stamp_ns - expected) < 1000
+
+
+def test_dates_without_a_zone_take_the_map_s(read):
+    rows = ["2026-11-21 14:03:05,500;1", "2026-11-21 14:03:06,500;2"]
+    mapping = DATED + "delimiter: ';'\nzone: '-05:30'\n"
+    read("\n".join(["t;d", *rows]), mapping)
+    expected = np.datetime64("2026-11-21T19:33:05.5", "ns").astype(np.int64)
+    assert abs(read.importer.blocks()[0].stamp_ns - expected) < 1000
+
+
+def test_seconds_since_1970_set_the_clock(read):
+    mapping = DATED.replace("date", "unix")
+    read("t,d\n1763200000.25,1\n1763200000.26,2\n1763200000.27,3\n", mapping)
+    assert abs(read.importer.blocks()[0].stamp_ns - 1763200000_250_000_000) < 1000
+
+
+# ------------------------------------------------------------------------ refused in one line
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "said"),
+    [
+        ("i;d\n0;1.234,5\n", 'delimiter: ";"\ndecimal: ","\n', "thousands"),
+        ("i;d\n0;1.234\n", 'delimiter: ";"\ndecimal: ","\n', "thousands"),
+        ("i,d\n0,1 234.5\n", "", "line 2"),
+        ('i,d\n0,"1,234.5"\n', "", "3 cells under 2 names"),
+        ("i\td\n0\t1,5\n", 'delimiter: "\\t"\n', "decimal: ','"),
+        ("i;d\n0;1\n", "", "delimiter: ';'"),
+        ("Logger 7\nno. 12\ni,d\n0,1\n", "", "lines_before_names: 2"),
+        ("i,d\n,um\n0,1\n", "", "line 2"),
+        ("i,d\n0,1\nmean,1\n", "", "line 3"),
+        ("i,d\n0,1\n1,2\n2", "", "was it cut"),
+        ("i,d\n0,---\n", "", "invalid: ['---']"),
+        ("0,1\n1,2\n", "", "by place"),
+        ("i,d\n0,=A1*2\n", "", "line 2"),
+        ("i,d\n0,1.5 µm\n", "", "line 2"),
+        ("i,d\n0,１２\n", "", ""),
+    ],
+)
+def test_what_would_be_another_number_is_refused(read, text, more, said):
+    if "１" in text:  # digits of another script are digits to Python, and to us
+        assert read(text) == pytest.approx([12.0])
+        return
+    assert said in refusal(read, text, PROBE + more).replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"PK\x03\x04 a workbook", "save the sheet as CSV"),
+        (b"\xd0\xcf\x11\xe0 an old one", "save the sheet as CSV"),
+        ("d\n1\n".encode("utf-16-le"), "zero bytes"),
+        (b"TDSm....", "name it .tdms"),
+        (b"\x89HDF\r\n", "name it .h5"),
+        (b"d\n" + b"1" * 5_000_000, "more than 100000 characters"),
+    ],
+)
+def test_what_is_no_text_is_told_what_it_is(read, data, said):
+    assert said in refusal(read, data)
+
+
+@pytest.mark.parametrize(
+    ("rows", "more", "said"),
+    [
+        (["2026-11-21T14:03:05,1"], "", "no time zone"),
+        (["21.11.2026 14:03:05,1"], "", "ISO 8601"),
+        (["11/21/2026 2:03:05 PM,1"], "", "ISO 8601"),
+        (["45982.58,1"], "", "ISO 8601"),
+        (["2026-13-41T14:03:05Z,1"], "", "line 2"),
+        (["2026-11-21T14:03:05Z,1"], "zone: Z\n", "leave zone out"),
+        (["2026-11-21T14:03:05Z,1"] * 3, "", "too coarsely"),
+        (["2026-11-21T14:03:05Z,1", "2026-11-21T14:03:06Z,2"], "start: 5\n", "leave start out"),
+    ],
+)
+def test_a_date_that_says_not_when_is_refused(read, rows, more, said):
+    assert said in refusal(read, "\n".join(["t,d", *rows]), DATED + more)
+
+
+@pytest.mark.parametrize("name", ["d [mm]", "d (mm)", "d/mm"])
+def test_a_unit_that_the_file_contradicts_is_refused(read, name):
+    mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: '{name}', unit: um}}\n"
+    assert "in mm, the map in um" in refusal(read, f"{name}\n1\n2\n", mapping)
+    stated = mapping.replace("unit: um", "unit: count, count: 1e-6")
+    assert read(f"{name}\n1\n2\n", stated) == pytest.approx([1, 2])
+
+
+def test_side_by_side_by_time_though_one_begins_later(importer):
+    """Rows belong together by time, not by their places."""
+    time = np.arange(0, 1, 0.001)
+    z = ["t,Z", *(f"{t:.3f},{t}" for t in time)]
+    gap = ["t,d", *(f"{t:.3f},{-t}" for t in time[250:])]
+    (importer.folder / "z.csv").write_text("\n".join(z))
+    (importer.folder / "d.csv").write_text("\n".join(gap))
+    axes = "".join(f"  {a}: {{constant: 0}}\n" for a in "xybc")
+    importer(
+        "columns:\n  time: {name: t, unit: s}\n  z: {name: Z, unit: mm}\n"
+        "  distance: {name: d, unit: mm}\n" + axes,
+        "z.csv", "d.csv",
+    )  # fmt: skip
+    first = importer.blocks()[0]
+    assert first.first_sample == 250
+    assert first.stamp_ns == 250_000_000
