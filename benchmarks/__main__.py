@@ -35,6 +35,7 @@ PARTS = (
         "budget",
     ),
     "twin",
+    "campaign",
 )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 from scipy import signal
 
-from benchmarks.row import Row, at_least, at_most
+from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.storage import bags
@@ -30,9 +30,9 @@ _BLOCK = 100
 _RUNS = 5
 
 
-def _write_bag(path: Path, samples: int, block: int = _BLOCK) -> None:
+def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -> None:
     """A spiral-like motion of ``samples``, cheap to make."""
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
     noise = random.normal(0.0, 1e-8, block)
     zero = np.zeros(block)
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
@@ -50,7 +50,8 @@ def _write_bag(path: Path, samples: int, block: int = _BLOCK) -> None:
             bag.write_distance(DistanceBlock(**common, distance=noise[:n]))
 
 
-def _calibration(path: Path) -> None:
+def save_paper_calibration(path: Path) -> None:
+    """The paper's response, known to a thousandth."""
     coefficients = np.r_[PAPER_DYNAMICS.numerator, PAPER_DYNAMICS.denominator[1:], 0.0]
     variance = (1e-3 * coefficients) ** 2
     variance[0] = 0.0
@@ -103,7 +104,7 @@ def _whole_processes(folder: Path) -> Iterator[Row]:
         begin = time.perf_counter()
         subprocess.run(command, check=True)
         loading.append(time.perf_counter() - begin)
-    yield _figure("python -c 'import scipy.signal', beside it", float(np.median(loading)), "s")
+    yield shown("python -c 'import scipy.signal', beside it", float(np.median(loading)), "s")
 
 
 def _rates(folder: Path, samples: int, used: Used, start: Used) -> Iterator[Row]:
@@ -121,13 +122,8 @@ def _rates(folder: Path, samples: int, used: Used, start: Used) -> Iterator[Row]
     filtered = len(z) / (time.process_time() - begin)
     name = "bag to cloud with uncertainty, long bag, samples a second and core"
     yield at_least(name, ours / 1e6, "10⁶/s", 2.5)
-    yield _figure("  bare read of the same bag, times as fast", read / ours, "1")
-    yield _figure("  scipy.signal.lfilter of order 5, times as fast", filtered / ours, "1")
-
-
-def _figure(name: str, value: float, unit: str) -> Row:
-    """A figure beside others, with no bar of its own."""
-    return Row(name=name, value=value, unit=unit, runs=None, peer=None, bar="", holds=None)
+    yield shown("  bare read of the same bag, times as fast", read / ours, "1")
+    yield shown("  scipy.signal.lfilter of order 5, times as fast", filtered / ours, "1")
 
 
 def rows(full: bool) -> Iterator[Row]:
@@ -135,15 +131,15 @@ def rows(full: bool) -> Iterator[Row]:
     long_points = LONG_POINTS if full else LONG_POINTS // 10
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        _calibration(folder / "cal.json")
+        save_paper_calibration(folder / "cal.json")
         for bag, samples in (("paper", PAPER_POINTS), ("ten", 10 * PAPER_POINTS)):
-            _write_bag(folder / f"{bag}.mcap", samples)
+            write_spiral(folder / f"{bag}.mcap", samples)
         yield from _whole_processes(folder)
         once = _correct(folder, "paper.mcap")
         ten = _correct(folder, "ten.mcap")
         text = "omsm correct, ten times the samples: times the time"
         yield at_most(text, ten.cpu / once.cpu, "1", 11.0)
-        _write_bag(folder / "long.mcap", long_points)
+        write_spiral(folder / "long.mcap", long_points)
         used = _correct(folder, "long.mcap")
         yield from _rates(folder, long_points, used, once)
         size = (folder / "long.mcap").stat().st_size / 2**30

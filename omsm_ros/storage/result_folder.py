@@ -53,8 +53,14 @@ def _refusal(path: Path | str, err: Exception) -> FileError:
 
 def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
     if not target.exists():
-        staged.rename(target)
-        return
+        try:
+            staged.rename(target)
+        except OSError:
+            if not target.is_dir():
+                raise
+        else:
+            return
+        # Another writer came first: what follows replaces its files.
     for part in staged.iterdir():
         if (target / part.name).is_dir():
             raise IsADirectoryError(None, f"{part.name!r} there is a folder; remove it")

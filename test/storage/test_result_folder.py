@@ -2,6 +2,7 @@
 
 import os
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -62,6 +63,16 @@ def test_two_writers_do_not_mix(tmp_path):
     for writer in writers:
         writer.join()
     assert len(set(held(tmp_path / "out").values())) == 1
+    assert [part.name for part in tmp_path.iterdir()] == ["out"]
+
+
+def test_who_comes_second_into_a_new_folder_replaces_the_first(tmp_path, monkeypatch):
+    """A worker that was taken for dead may finish beside the one that took its bag over."""
+    put(tmp_path / "out", "1")
+    with monkeypatch.context() as first_look:
+        first_look.setattr(Path, "exists", lambda path: False)
+        put(tmp_path / "out", "2")
+    assert held(tmp_path / "out") == dict.fromkeys(NAMES, "2")
     assert [part.name for part in tmp_path.iterdir()] == ["out"]
 
 
