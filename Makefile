@@ -18,7 +18,7 @@ NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
-.PHONY: setup demo test lint bench soak docs lock clean distclean
+.PHONY: setup demo test matrix lint bench soak docs lock clean distclean
 
 setup: $(PACKAGE)
 
@@ -35,6 +35,11 @@ lint: setup
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
 	$(RUN) if python -c "$(NUMPY_TYPED)"; then mypy; fi
+
+# The tests on each Python that is installed, one after the other; `make matrix GOAL=lint` does less.
+GOAL ?= test
+matrix:
+	bootstrap/matrix.sh $(GOAL)
 
 # Ten minutes; `make bench FULL=1` has all runs and long recordings, for an hour.
 bench: $(PEERS)

@@ -43,6 +43,7 @@ setup(
         "viewer": ["websockets>=14"],
         "devices": ["pyads", "nidaqmx"],
         "campaign": ["distributed"],
+        "completion": ["shtab"],
         "catalogue": ["sqlalchemy>=2", "psycopg[binary]>=3.1"],
     },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the

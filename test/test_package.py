@@ -34,6 +34,7 @@ OPTIONAL = {
     "nptdms": "formats",
     "distributed": "campaign",
     "pyads": "devices",
+    "shtab": "completion",
     "websockets": "viewer",
     "nidaqmx": "devices",
     "sqlalchemy": "catalogue",
@@ -102,4 +103,4 @@ def test_what_is_optional_is_an_extra():
     found = re.search(r"extras_require=(\{.*?\}),", setup, re.DOTALL)
     extras = ast.literal_eval(found[1])
     for package, extra in OPTIONAL.items():
-        assert any(line.startswith(package) for line in extras[extra])
+        assert any(line.lower().startswith(package) for line in extras[extra])

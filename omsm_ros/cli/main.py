@@ -34,6 +34,8 @@ WORDS = {
     "omsm_ros.cli.calibrating": ("plan", "verify", "compare", "calset"),
     "omsm_ros.cli.starting": ("twin", "doctor"),
     "omsm_ros.cli.importing": ("import",),
+    "omsm_ros.cli.reporting": ("report",),
+    "omsm_ros.cli.completing": ("completion",),
     "omsm_ros.cli.campaigning": ("batch",),
     "omsm_ros.cli.remembering": ("history",),
     "omsm_ros.cli.exporting": ("export",),
@@ -46,11 +48,11 @@ _DEMO_HELP = "calibrate and measure on the digital twin (needs ROS)"
 
 # As one comes to need them, for the list of all commands.
 TASKS = {
-    "begin": ("doctor", DEMO, "twin"),
+    "begin": ("doctor", DEMO, "twin", "completion"),
     "recordings": ("inspect", "import"),
     "dynamics of probe and machine": ("plan", "identify", "verify", "compare", "calset"),
     "latency": ("selfcal", "reversal", "latency"),
-    "a scan": ("surface", "predict", "align", "correct"),
+    "a scan": ("surface", "predict", "align", "correct", "report"),
     "the part": ("form", "compensate", "difference", "spectrum", "export"),
     "many scans": ("batch", "history"),
     "models of other systems": ("validate",),

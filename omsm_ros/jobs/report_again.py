@@ -1,0 +1,39 @@
+"""The page of a measurement that was corrected earlier, drawn from what lies in its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.errors import CalibrationError, FileError
+from omsm_ros.jobs.correct_bag import MOST_DRAWN
+from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
+from omsm_ros.storage import strict_json
+from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, read_text
+
+_MAX_SUMMARY_BYTES = 10_000_000
+
+
+def report_again(result: Path, calibration: Calibration, nominal: Surface | None = None) -> Path:
+    """Write ``report.html`` into the folder ``result`` of ``omsm correct``; return its path.
+
+    Nothing is computed anew: every figure comes from the summary there, every map from its cloud.
+    Raises FileError for a folder that holds no measurement, CalibrationError for another
+    calibration than the one it was corrected with.
+    """
+    what = f"summary {str(result / SUMMARY)!r}"
+    text = read_text(result / SUMMARY, _MAX_SUMMARY_BYTES, FileError, "summary")
+    summary = strict_json.object_of(text, FileError, what)
+    used = summary.get("calibration")
+    if used != calibration.id:
+        raise CalibrationError(
+            f"{str(result)!r} was corrected with calibration {str(used)[:12]!r}, given is "
+            f"{calibration.id[:12]!r}; give the one that it was corrected with"
+        )
+    view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), calibration.sample_period)
+    figures = figures_of(view, calibration, nominal, calibration.sample_period)
+    title = f"Surface of {Path(str(summary.get('bag', result))).name}"
+    publish(result, title, summary, calibration, figures, map_of(view, nominal, result))
+    return result / REPORT
