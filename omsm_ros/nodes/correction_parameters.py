@@ -46,7 +46,7 @@ PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
         "calibration_folders",
-        "~:.",
+        "~:.:/tmp",
         "what load_calibration may read from, separated by ':'; ~ = home, . = where the node was "
         "started; empty = any folder",
     ),
