@@ -11,6 +11,7 @@ node says what each of the two steps makes, and on the stack that it is handed, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import Enum
@@ -29,6 +30,9 @@ from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, survive
 from omsm_ros.parameters import Parameter
 
 NAMESPACE = "omsm"
+# A publisher that is destroyed takes along what who listens has not fetched yet; the middleware
+# itself would tell so only every three seconds. In steps, as a busy machine counts time.
+_STEPS, _STEP_S = 20, 0.01
 AUTOSTART = Parameter("autostart", True, "configure and activate at the start", fixed=True)
 
 
@@ -155,15 +159,24 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return TransitionCallbackReturn.SUCCESS
 
     def _end(self, reached: Stage) -> TransitionCallbackReturn:
-        stacks = [self._activated] if reached is Stage.INACTIVE else None
-        for stack in stacks or (self._activated, self._configured):
-            try:
-                stack.close()
-            except Exception as err:  # the rest has been undone all the same
-                survive(self, err)
+        self._undo(self._activated)
+        if reached is not Stage.INACTIVE:
+            self._let_the_last_arrive()
+            self._undo(self._configured)
         self.stage = reached
         self._failure = None
         return TransitionCallbackReturn.SUCCESS
+
+    def _undo(self, stack: ExitStack) -> None:
+        try:
+            stack.close()
+        except Exception as err:  # the rest has been undone all the same
+            survive(self, err)
+
+    def _let_the_last_arrive(self) -> None:
+        if any(publisher.get_subscription_count() for publisher in self._outputs):
+            for _ in range(_STEPS):
+                time.sleep(_STEP_S)
 
     def _answer_impossible_transitions(self) -> None:
         """Let a request for a transition that is none be answered, as refused, not raised."""

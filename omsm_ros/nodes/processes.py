@@ -37,7 +37,7 @@ class NodeProcesses:
         self, label: str, node: str, arguments: Sequence[str], **parameters: object
     ) -> None:
         """Start ``node``, called ``label`` here, with arguments for ROS and parameters."""
-        command = [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *arguments]
+        command = [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *arguments]
         for name, value in parameters.items():
             command += ["-p", f"{name}:={_parameter_text(value)}"]
         with (self._folder / f"{label}.log").open("ab") as log:

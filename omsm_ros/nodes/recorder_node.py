@@ -36,8 +36,11 @@ _TOPICS = {
 }
 
 _FLUSH_PERIOD_S = 0.5
-_ON_ITS_WAY_S = 0.2  # a hundred times what a message takes on one machine
-_LONGEST_S = 2.0  # of publishers that are not ended; a launch waits for five
+# Looks in a row that find nothing, until nothing is on its way: 0.2 s, a hundred times what a
+# message takes. Looks, not time, for on a busy machine neither this process nor its middleware
+# may have had its turn in that time.
+_LOOKS, _LOOK_S = 20, 0.01
+_LONGEST_S = 3.0  # of publishers that are not ended; a launch waits for five
 
 
 class RecorderNode(ManagedNode):
@@ -115,11 +118,11 @@ class RecorderNode(ManagedNode):
             self.get_logger().error(f"{type(err).__name__}: {err}")
 
     def _take_what_is_on_its_way(self) -> None:
-        begin = quiet_since = time.monotonic()
-        while time.monotonic() < min(quiet_since + _ON_ITS_WAY_S, begin + _LONGEST_S):
-            if sum(take_waiting(s, partial(self._take, t)) for t, s in self._heard.items()):
-                quiet_since = time.monotonic()
-            time.sleep(_ON_ITS_WAY_S / 20)
+        begin, in_vain = time.monotonic(), 0
+        while in_vain < _LOOKS and time.monotonic() - begin < _LONGEST_S:
+            came = sum(take_waiting(s, partial(self._take, t)) for t, s in self._heard.items())
+            in_vain = 0 if came else in_vain + 1
+            time.sleep(_LOOK_S)
 
     # --------------------------------------------------------------------- diagnostics
 

@@ -23,11 +23,11 @@ from rclpy.signals import SignalHandlerOptions
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
+from omsm_ros.nodes.start import ENDING, nothing_to_undo
 from omsm_ros.nodes.topics import REQUESTS_QOS
 from omsm_ros.storage import strict_json
 
 _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # A node that has not ended so long after it was asked to ends at the next signal, as it stands.
 _PATIENCE_S = 5.0
 # For a log message of a node that cannot start to reach who listens on /rosout.
@@ -42,7 +42,8 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
     """
     node = None
     try:
-        _init()
+        with nothing_to_undo():
+            _init()
         ending = _Ending()  # after rclpy, which puts back the handlers of the system
         node = make_node()
         node.start()
@@ -93,7 +94,7 @@ class _Ending:
         self._wake: Callable[[], object] = lambda: None
         self._heard, told = os.pipe()
         os.set_blocking(told, False)
-        for number in _ENDING:
+        for number in ENDING:
             # Below nohup, it is to be ignored.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
@@ -108,14 +109,14 @@ class _Ending:
 
     def ignore_signals(self) -> None:
         """Let none that is still to come spoil the exit code; Python lets go of its handlers."""
-        for number in _ENDING:
+        for number in ENDING:
             signal.signal(number, signal.SIG_IGN)
 
     def _wait(self) -> None:
         asked = 0.0
         while True:
             (number,) = os.read(self._heard, 1)
-            if number not in _ENDING:
+            if number not in ENDING:
                 continue
             if not asked:
                 asked = time.monotonic()

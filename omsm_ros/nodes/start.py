@@ -1,5 +1,7 @@
 """Where the command of every node begins; without ROS it ends there, in one line with the remedy.
 
+Nothing is imported here that takes time: a Ctrl-C while the rest loads is an end like any other.
+
 ``pip install`` puts the commands of the nodes beside ``omsm``, and ``ros2 run`` finds them in a
 workspace whose messages were not built. ``python -m omsm_ros.nodes.start corrector …`` is the same.
 """
@@ -7,8 +9,15 @@ workspace whose messages were not built. ``python -m omsm_ros.nodes.start correc
 from __future__ import annotations
 
 import importlib
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that ask a node to end."""
 
 _BAD_INPUT = 2
 _OTHER_NAMES = {"replay": "player"}
@@ -26,13 +35,27 @@ _NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
 def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
-    for package, remedy in _NEEDED.items():
-        try:
-            importlib.import_module(package)
-        except ImportError as err:
-            print(f"{name}: {err}: {remedy}", file=sys.stderr)
-            sys.exit(_BAD_INPUT)
-    importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node").main()
+    with nothing_to_undo():
+        for package, remedy in _NEEDED.items():
+            try:
+                importlib.import_module(package)
+            except ImportError as err:
+                print(f"{name}: {err}: {remedy}", file=sys.stderr)
+                sys.exit(_BAD_INPUT)
+        node = importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node")
+    node.main()
+
+
+@contextmanager
+def nothing_to_undo() -> Iterator[None]:
+    """Let a signal end the process at once and well, while it only loads."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as SIGHUP is below nohup
+            signal.signal(number, lambda *_: os._exit(0))
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def test_parameters_tell_their_meaning_and_range(cell):
 
 
 def start(node, *arguments):
-    command = [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *arguments]
+    command = [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
@@ -164,20 +164,29 @@ def test_an_override_is_of_its_topic_alone(cell):
         assert heard.qos_profile.reliability is ReliabilityPolicy.RELIABLE
 
 
-@pytest.mark.parametrize("node", ["cell_emulator", "confocal_driver"])
-def test_two_interrupts_end_a_node_well(node, tmp_path):
-    """As ``ros2 launch`` sends them: exit code 0 and no traceback, wherever the second falls."""
+@pytest.mark.parametrize(
+    ("node", "after"),
+    [
+        ("cell_emulator", 0.5),  # while it loads
+        ("cell_emulator", 4.0),
+        pytest.param("confocal_driver", 4.0, marks=pytest.mark.soak),
+        *(pytest.param("corrector", k / 4, marks=pytest.mark.soak) for k in range(1, 16)),
+    ],
+)
+def test_two_interrupts_end_a_node_well(node, after, tmp_path):
+    """As ``ros2 launch`` sends them: exit code 0 and no traceback, wherever they fall."""
     given = {
         "cell_emulator": ["-p", f"link:={tmp_path / 'port'}"],
         "confocal_driver": ["-p", "port:=/dev/null"]
         + [w for a in "xyzbc" for w in ("-p", f"{a}.counts_per_unit:=1.0e10")],
+        "corrector": ["-p", "lateral_lag:=0.0"],
     }[node]
     process = subprocess.Popen(
-        [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", *given],
+        [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *given],
         stderr=subprocess.PIPE,
         text=True,
     )
-    time.sleep(4.0)
+    time.sleep(after)
     for _ in range(2):
         process.send_signal(signal.SIGINT)
         time.sleep(0.02)
