@@ -222,6 +222,7 @@ SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")
 # ------------------------------------------------------------------------------- devices
 
 BAUD_RATE = Quantity("baud rate", "bit/s", 50, 50_000_000, "as the device has it", whole=True)
+SILENCE = Quantity("silence", "s", 0.0, 86_400.0, "0 = as long as it may be")
 TCP_PORT = Quantity("TCP port", "", 0, 65535, "0 = none", whole=True)
 BLOCK_SAMPLES = Quantity("samples in a block", "", 1, 4_000_000, "100 serve most", whole=True)
 COUNTS_PER_UNIT = Quantity(

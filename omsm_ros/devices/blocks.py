@@ -39,13 +39,15 @@ class BlockPair(NamedTuple):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockSettings:
     """sample_period: nominal [s];  block_size: samples;  pause: a partial block is handed over
-    when nothing came for so long [s];  free_running: the device keeps the period itself, so a
-    block at another rate is withheld.
+    when nothing came for so long [s];  renew: a connection that is silent for so long is made
+    anew, which costs a sample or two if it was well [s]; 0 = never;  free_running: the device
+    keeps the period itself, so a block at another rate is withheld.
     """
 
     sample_period: float = 1e-3
     block_size: int = 100
     pause: float = 0.2
+    renew: float = 0.0
     free_running: bool = False
 
     def __post_init__(self) -> None:

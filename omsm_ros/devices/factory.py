@@ -86,8 +86,15 @@ DEVICE = Parameter(
     "what is connected: see docs/devices.md",
     choices=(*_STREAMS, *_CHROCODILES, *_CONFOCALDTS),
 )
+RENEW = Parameter(
+    "renew",
+    10.0,
+    "a stream over TCP that is silent for so long is connected anew [s]; 0 = never",
+    quantities.SILENCE,
+)
 _STREAM_PARAMETERS = (
     PORT,
+    RENEW,
     Parameter(
         "baud_rate",
         DEFAULT_BAUD_RATE,
@@ -188,10 +195,16 @@ def block_settings(values: Values) -> dict[str, Any]:
     return {"sample_period": values["sample_period"], "block_size": values["block_size"]}
 
 
+def _stream_settings(values: Values) -> dict[str, Any]:
+    """Of a stream that cannot be asked whether it rests or is gone; a serial line is never half."""
+    renew = values["renew"] if values["port"].startswith("tcp://") else 0.0
+    return block_settings(values) | {"renew": renew}
+
+
 def _six_channel(values: Values, transport: Transport, now_ns: NowNs) -> StreamDevice:
     probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
     scaling = StreamScaling(**_axes(values), probe=probe)
-    settings = StreamSettings(**block_settings(values), scaling=scaling)
+    settings = StreamSettings(**_stream_settings(values), scaling=scaling)
     return GenericStreamDevice(transport, settings, now_ns)
 
 
@@ -199,7 +212,7 @@ def _six_channel_text(values: Values, transport: Transport, now_ns: NowNs) -> St
     probe = ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
     columns = tuple(values["columns"].replace(",", " ").split())
     scaling = StreamScaling(**_axes(values, [a for a in AXES if a in columns]), probe=probe)
-    settings = CsvSettings(**block_settings(values), columns=columns, scaling=scaling)
+    settings = CsvSettings(**_stream_settings(values), columns=columns, scaling=scaling)
     return CsvStreamDevice(transport, settings, now_ns)
 
 

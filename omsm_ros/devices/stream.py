@@ -34,6 +34,7 @@ class StreamStatistics:
     restarts: the device's counter or clock fell back
     period_deviation: of the last full block's device time from nominal, relative
     period_warnings: full blocks beyond PERIOD_TOLERANCE
+    renewals: connections made anew, because nothing came
     """
 
     decoded: int = 0
@@ -49,6 +50,7 @@ class StreamStatistics:
     blocks: int = 0
     period_deviation: float = 0.0
     period_warnings: int = 0
+    renewals: int = 0
 
 
 class StreamDevice:
@@ -79,6 +81,7 @@ class StreamDevice:
         self._decoded = 0
         self._heard = self._opened = monotonic()
         self._down = False
+        self._renewals = 0
 
     def open(self) -> None:
         """Connect, or connect again, and set the device up; raises DeviceError."""
@@ -103,7 +106,12 @@ class StreamDevice:
         if silent <= self._settings.pause:
             return []
         blocks = self._end(arrival_ns)
-        self._listen_in(now - max(self._heard, self._opened))
+        silent = now - max(self._heard, self._opened)
+        self._listen_in(silent)
+        if 0 < self._settings.renew < silent:
+            # One that still says nothing may be at rest; one that is gone refuses.
+            self.open()
+            self._renewals += 1
         return blocks
 
     def close(self) -> list[BlockPair]:
@@ -147,6 +155,7 @@ class StreamDevice:
             blocks=cutter.blocks,
             period_deviation=cutter.period_deviation,
             period_warnings=cutter.period_warnings,
+            renewals=self._renewals,
         )
 
     def counts(self) -> dict[str, float]:

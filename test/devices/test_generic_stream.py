@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from omsm_ros.core.samples.blocks import Status
 from omsm_ros.devices.counting import Counting, SequenceTracker
 from omsm_ros.devices.generic_stream import GenericStreamDevice, StreamSettings, samples_of
+from omsm_ros.errors import DeviceError
 from omsm_ros.protocols.generic_stream import (
     AxisScaling,
     ProbeScaling,
@@ -185,3 +186,59 @@ def test_tracker_agrees_with_plain_counting(
     assert tracker.lost == numbers[-1] - numbers[0] + 1 - len(np.unique(numbers))
     assert tracker.gaps == sum(step > 1 for step in steps)
     assert tracker.restarts == 0
+
+
+# --- silence ----------------------------------------------------------------------------
+
+
+class Moments:
+    """A clock that is set."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def polled(script: Script, renew: float, seconds: float) -> GenericStreamDevice:
+    clock = Moments()
+    device = GenericStreamDevice(script, StreamSettings(renew=renew), monotonic=clock)
+    device.open()
+    for _ in range(round(seconds / 0.5)):
+        clock.now += 0.5
+        device.poll(0.05)
+    return device
+
+
+def test_a_silent_stream_is_connected_anew_again_and_again() -> None:
+    script = Script()
+    device = polled(script, renew=10.0, seconds=35.0)
+    assert device.statistics.renewals == 3
+    assert script.opened == 4
+
+
+def test_one_that_speaks_or_may_rest_is_left_alone() -> None:
+    portions = [encode_frames(frames_of([k])) for k in range(70)]
+    assert polled(Script(*portions), renew=10.0, seconds=35.0).statistics.renewals == 0
+    assert polled(Script(), renew=0.0, seconds=35.0).statistics.renewals == 0
+
+
+def test_what_comes_on_the_new_connection_goes_on_in_the_count() -> None:
+    """The counter tells what the silence cost."""
+    first, then = (encode_frames(frames_of(list(range(a, a + 10)))) for a in (0, 15))
+    script = Script(first, *[b""] * 30, then)
+    device = polled(script, renew=10.0, seconds=16.0)
+    assert device.statistics.renewals == 1
+    assert (device.statistics.decoded, device.statistics.lost) == (20, 5)
+
+
+def test_one_that_is_gone_is_an_error() -> None:
+    class Gone(Script):
+        def open(self) -> None:
+            super().open()
+            if self.opened > 1:
+                raise DeviceError("no route to host")
+
+    with pytest.raises(DeviceError, match="no route"):
+        polled(Gone(), renew=10.0, seconds=35.0)

@@ -19,16 +19,20 @@ class BrokenWire:
         self.connections = 0
         self._vanished, self._ended = threading.Event(), threading.Event()
         self._noise = b""
-        self._ends = []
+        self._ends, self._threads = [], []
 
     def __enter__(self):
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._start(self._accept)
         return self
 
     def __exit__(self, *_):
         self._ended.set()
+        self._listening.shutdown(socket.SHUT_RDWR)
+        self._threads[0].join()
         self._listening.close()
         self.cut()
+        for thread in self._threads:
+            thread.join()
 
     def vanish(self):
         self._vanished.set()
@@ -49,14 +53,24 @@ class BrokenWire:
     def _accept(self):
         while not self._ended.is_set():
             with suppress(OSError):
-                driver, _ = self._listening.accept()
-                while self._vanished.is_set() and not self._ended.is_set():
-                    time.sleep(0.05)
-                device = socket.create_connection(("127.0.0.1", self._device_port))
-                self.connections += 1
-                self._ends += [driver, device]
-                for ends in ((driver, device, False), (device, driver, True)):
-                    threading.Thread(target=self._pass_on, args=ends, daemon=True).start()
+                self._connect(self._listening.accept()[0])
+
+    def _connect(self, driver):
+        while self._vanished.is_set() and not self._ended.is_set():
+            time.sleep(0.05)
+        try:
+            device = socket.create_connection(("127.0.0.1", self._device_port))
+        except OSError:
+            driver.close()
+            return
+        self.connections += 1
+        self._ends += [driver, device]
+        self._start(self._pass_on, driver, device, False)
+        self._start(self._pass_on, device, driver, True)
+
+    def _start(self, work, *arguments):
+        self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
+        self._threads[-1].start()
 
     def _pass_on(self, source, sink, from_device):
         with source, suppress(OSError):

@@ -54,14 +54,14 @@ class Cell:
         given = {"port": self.link} | emulated("six_channel").driver
         self.processes.start("confocal_driver", **(given | parameters))
 
-    def start_correcting(self, calibration, **emulator):
+    def start_correcting(self, calibration, driver=None, **emulator):
         """Emulator, driver and corrector, all connected."""
         from omsm_ros.storage.calibration_file import save_calibration
 
         path = self.folder / "cal.json"
         save_calibration(path, calibration)
         self.start_emulator(**emulator)
-        self.start_driver()
+        self.start_driver(**(driver or {}))
         self.processes.start("corrector", calibration=str(path))
         value = self.operator.value
         self.wait(

@@ -1,11 +1,14 @@
 """What a shop sees on /diagnostics: the state now, told by everyone whom it concerns."""
 
+import os
 import signal
+import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from std_srvs.srv import Trigger
+from system.broken_wire import BrokenWire
 
 from omsm_ros.emulators.players import emulated
 from omsm_ros.storage import conversions
@@ -145,3 +148,33 @@ def test_two_cells_side_by_side(cell, true_calibration):
             ),
         )
         assert cell.settle(name(namespace, "corrector"), "axes_received") == samples
+
+
+@pytest.mark.soak
+def test_a_device_that_vanishes_is_stale_then_connected_anew_and_its_gap_counted(
+    cell, true_calibration
+):
+    """Both ends of the connection stay up, and nothing passes."""
+    device_port = 18_000 + os.getpid() % 1000
+    with BrokenWire(device_port) as wire:
+        cell.start_correcting(
+            true_calibration,
+            link=f"tcp://127.0.0.1:{device_port}",
+            time_lapse=1.0,
+            driver={"port": f"tcp://127.0.0.1:{wire.port}", "renew": 4.0},
+        )
+        assert cell.call(Trigger, "cell_emulator/scan").success
+        value = cell.operator.value
+        cell.wait("samples", lambda: value("corrector", "axes_received") > 1000)
+        wire.vanish()
+        until(cell, "confocal_driver", STALE, "no sample for")
+        cell.wait("a new connection", lambda: value("confocal_driver", "renewals") >= 1)
+        before = value("corrector", "axes_received")
+        wire.come_back()
+        back = time.monotonic()
+        cell.wait("samples", lambda: value("corrector", "axes_received") > before)
+        assert time.monotonic() - back < 4.0 + 5.0
+        cell.wait(
+            "the gap, the same at both",
+            lambda: value("confocal_driver", "lost") == value("corrector", "missing_axes") > 3000,
+        )
