@@ -41,8 +41,10 @@ _FINER = 8
 _GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
 # Of a period in the travel: 98 µm in steps make 1 µm, a fringe of a scale or of an interferometer.
 _MOST_CYCLES = 100
-# Of Legendre polynomials: from a bend to what wanders eight times over the record.
-_DRIFT_DEGREES = (2, 3, 4, 6, 8)
+# A period half a cycle off leaves as much as it takes, and would call for a second one.
+_BETWEEN_CYCLES = 37
+# Of Legendre polynomials: from a bend to four periods over the record, where lines begin.
+_DRIFT_DEGREES = (2, 3, 4, 6, 8, 12, 16)
 # Of vibration at a time: the next round looks for more.
 _LINES_TRIED = 3
 
@@ -128,10 +130,13 @@ class Departures:
         back = fft.irfft(spectra, self.problem.closed_length, axis=-1)
         return np.asarray(back[..., : len(self.problem.input)].T)
 
-    @property
+    @cached_property
     def _answer(self) -> ComplexArray:
-        """Spectrum of what the motion gave, at ``problem.s``."""
-        return self.problem.answer(self.fitted)
+        """Spectrum of what the motion gave, at ``problem.s``; not what rang before the record.
+
+        That is known only as far as it lasts into the samples compared, and is huge before.
+        """
+        return self.problem.moved(self.fitted)
 
     def time_constants(self) -> FloatArray:
         """Return the time constants [s] that are looked for, up to the record's length."""
@@ -182,7 +187,7 @@ class Departures:
         found = []
         for _ in range(_LINES_TRIED):
             peak = int(np.argmax(power))
-            found.append(peak / (length * self.problem.period))
+            found.append(_vertex(power, peak) / (length * self.problem.period))
             power[max(peak - 8, 0) : peak + 9] = 0.0
         angles = 2 * np.pi * np.asarray(found) * time[:, np.newaxis]
         columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(samples, -1)
@@ -216,14 +221,20 @@ class Departures:
         largest = float(np.max(np.abs(deflection))) or 1.0
         return Family(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
 
-    def periodic(self) -> Family:
-        """Return sines of the position, with periods from the whole travel to a fraction of it."""
+    def periodic(self, near: float | None = None) -> Family:
+        """Return sines of the position, with periods from the whole travel to a fraction of it.
+
+        near: a period among those [m], to have periods between it and its neighbours instead
+        """
         answer = self._in_time(self._answer) / self.fitted.gain
         travel = float(np.ptp(answer)) or 1.0
         cycles = np.arange(3, _MOST_CYCLES, dtype=np.float64)
+        trials = float(len(cycles))
+        if near is not None:
+            cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
         angles = 2 * np.pi * answer[:, np.newaxis] / travel * cycles
         columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(len(answer), -1)
-        return Family(PERIODIC, np.asarray(travel / cycles), float(len(cycles)), columns)
+        return Family(PERIODIC, np.asarray(travel / cycles), trials, columns)
 
     def friction(self) -> Iterator[Family]:
         """Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
@@ -256,6 +267,19 @@ class Departures:
         columns = backlash_columns(self.steps, len(self.problem.input))
         if columns.shape[1]:
             yield Family(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+
+
+def _vertex(power: FloatArray, peak: int) -> float:
+    """Place of the maximum of ``power`` (n,) at ``peak``, by the parabola of its logarithm.
+
+    Half a line off, a sine leaves a fifth of itself at the ends of the record.
+    """
+    near = power[max(peak - 1, 0) : peak + 2]
+    if len(near) < 3 or np.min(near) <= 0:
+        return float(peak)
+    before, at, after = np.log(near)
+    bend = before - 2 * at + after
+    return peak + float(0.5 * (before - after) / bend) if bend < 0 else float(peak)
 
 
 def _geometric(low: float, high: float, step: float) -> FloatArray:

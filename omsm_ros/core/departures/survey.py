@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from omsm_ros.core.departures.families import Departures, Term
+from omsm_ros.core.departures.families import PERIODIC, Departures, Family, Term
 from omsm_ros.core.departures.residual_space import ResidualSpace, Score
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps
@@ -67,12 +67,17 @@ class Survey:
         """Return the most significant term of each family, by the name of the family."""
         found: dict[str, Judged] = {}
         for family in self.departures.families(self.only):
-            screened = self.space.screen(family.columns, family.width)
-            term = family.term(int(np.argmax(screened)))
+            term = self._best_of(family)
+            if family.name == PERIODIC:
+                term = self._best_of(self.departures.periodic(term.parameter))
             judged, before = Judged(term, self.space.score(term.columns)), found.get(family.name)
             if before is None or self.evidence(judged) > self.evidence(before):
                 found[family.name] = judged
         return found
+
+    def _best_of(self, family: Family) -> Term:
+        screened = self.space.screen(family.columns, family.width)
+        return family.term(int(np.argmax(screened)))
 
     @cached_property
     def creep(self) -> tuple[Judged, ...]:

@@ -26,6 +26,8 @@ _FREE_POLES = 8
 MAX_POLES = 20
 # A lag and its roll-off: with fewer, the band is three times too narrow on a pure delay.
 _LEAST_PARAMETERS = 3
+# Of the critical damping: a resonance beyond half the sampling rate shows in no sample.
+_DAMPED_BEYOND = 0.1
 # Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
 _CANCELLING = 0.005
 
@@ -124,6 +126,19 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
         and not cancels(c.fit.dynamics)
     ]
     return min(richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest)
+
+
+def identifiable(dynamics: TransferFunction, period: float, duration: float) -> bool:
+    """Return whether samples every ``period`` [s] for ``duration`` [s] can tell every pole.
+
+    One that decays no faster than the record lasts is a line of vibration or a drift; one that
+    rings beyond half the sampling rate fits noise, and a filter made of it would ring.
+    """
+    poles = dynamics.poles()
+    rate, decay = np.abs(poles), -poles.real
+    lasting = decay * duration < 1
+    ringing = (rate * period > np.pi) & (decay < _DAMPED_BEYOND * rate)
+    return not bool(np.any(lasting | ringing))
 
 
 def cancels(dynamics: TransferFunction) -> bool:

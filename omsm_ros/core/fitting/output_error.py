@@ -54,6 +54,7 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
+    reading_step: between neighbouring values of the readings [m], 0 if there is none
     """
 
     input: FloatArray
@@ -66,6 +67,7 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
+    reading_step: float = 0.0
 
     @cached_property
     def closed_length(self) -> int:
@@ -165,10 +167,16 @@ class Problem:
 
     def response(self, fitted: Fit) -> FloatArray:
         """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""
+        spectrum = self.moved(fitted) / fitted.gain
+        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
+
+    def moved(self, fitted: Fit) -> ComplexArray:
+        """Spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         terms = len(fitted.numerator)
-        spectrum = fitted.numerator @ self._driven(fitted.structure, lag)[:terms]
-        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
+        return np.asarray(
+            fitted.driven[:terms] @ self._driven(fitted.structure, lag)[:terms], np.complex128
+        )
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""

@@ -8,7 +8,7 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 | a model is chosen and fitted | :mod:`model_choice` |
 | what the residual shows besides is modelled | :mod:`departure_search` |
 | its covariance from noise | :mod:`response_uncertainty` |
-| further terms of it | :mod:`covariance_terms`, :mod:`hidden_terms` |
+| further terms of it | :mod:`covariance_terms`, :mod:`hidden_terms`, :mod:`consistency` |
 | checks | :mod:`checks` |
 | certificate and verdict | :mod:`certificate` |
 """
@@ -28,6 +28,7 @@ from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
 from omsm_ros.core.identification.certificate import certificate_of
 from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
+from omsm_ros.core.identification.consistency import consistency
 from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
@@ -105,6 +106,7 @@ def identify(
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
     hidden = hidden_covariance(searched.survey, settings or {}, limits)
+    hidden += [consistency(searched.survey)]
     hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
     known = response_uncertainty(prepared, model, limits, hidden)
     if model.free is not None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from omsm_ros.core.fitting.initial_condition import starts_ringing
 from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_choice import Candidate, choose, explore
-from omsm_ros.core.fitting.output_error import Fit, fit
+from omsm_ros.core.fitting.order_choice import Candidate, choose, explore, identifiable
+from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.fitting.starting_points import StartingPoints
 from omsm_ros.core.identification.residual_tests import noise_colour
@@ -40,12 +40,19 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
-    candidates = explore(fit_structure, order, noise_colour(problem, lag, prepared.steps))
+    explored = explore(fit_structure, order, noise_colour(problem, lag, prepared.steps))
+    candidates = _identifiable(problem, explored)
     free = Model(choose(candidates), candidates)
     if not order:
         return free
-    asked = [c for c in candidates if c.fit.structure.poles == order]
+    asked = [c for c in explored if c.fit.structure.poles == order]
     return Model(choose(asked), asked, free)
+
+
+def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
+    """Those whose poles the record can tell; a delay alone has none."""
+    duration = len(problem.input) * problem.period
+    return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 
 
 def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, Model]:

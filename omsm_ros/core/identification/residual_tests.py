@@ -26,6 +26,8 @@ _LAGS = 25
 _AFTER_EDGE_S = 50e-3
 # Then a standard deviation is known to a twentieth.
 _LEAST_REST_SAMPLES = 200
+# Then it is known to a tenth.
+_LEAST_CROSSINGS = 50
 # No probe tells less; a misfit below it is none.
 _FINEST_READING_M = 1e-10
 
@@ -49,12 +51,14 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
     on_grid = np.zeros(len(problem.used))
     on_grid[problem.used] = fitted.residual
     active = problem.used & _active(steps, problem.period)
-    rest = problem.used & ~active
-    noise = max(_noise(on_grid, problem.used, rest), _FINEST_READING_M)
-    moving = problem.used & steps.moving
-    if problem.shared > 0 and np.sum(moving) >= _LEAST_REST_SAMPLES:
-        # Readings that hardly change at rest do not tell the noise: rounding holds it.
-        noise = max(noise, _noise_of_neighbours(on_grid[moving]))
+    noise = max(_noise(on_grid, problem.used, problem.used & ~active), _FINEST_READING_M)
+    crossing = problem.used & (np.abs(np.gradient(problem.input)) > problem.reading_step)
+    if problem.shared > 0 and np.sum(crossing) >= _LEAST_CROSSINGS:
+        # Readings that hardly change at rest do not tell the noise: rounding holds it. Where the
+        # axis crosses a step from sample to sample, it scatters over the whole step.
+        active = crossing
+        rounding = problem.reading_step / np.sqrt(12.0)
+        noise = max(noise, rounding, _noise_of_neighbours(on_grid[crossing]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     timing = scatter_in_time(problem, fitted.residual)

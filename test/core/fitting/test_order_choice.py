@@ -15,6 +15,7 @@ from omsm_ros.core.fitting.order_choice import (
     choose,
     explore,
     held_out_rms,
+    identifiable,
     information,
     structures,
 )
@@ -86,6 +87,22 @@ def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
     dearer = information(large, 2.5) - information(small, 2.5)
     charge = 1.5 * (large.size - small.size) * math.log(n)
     assert dearer == pytest.approx(expected + charge, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "damping", "told"),
+    [
+        (50.0, 0.01, True),
+        (50.0, 1e-4, False),  # decays to 1/e in 32 s, the record takes ten
+        (700.0, 0.05, False),  # rings beyond 500 Hz
+        (700.0, 0.5, True),
+        (7e6, 1.0, True),  # too fast to be seen, and harmless
+    ],
+)
+def test_a_pole_is_told_by_samples_it_shows_in(frequency, damping, told):
+    omega = 2 * np.pi * frequency
+    pair = TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
+    assert identifiable(pair, 1e-3, 10.0) is told
 
 
 @pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])

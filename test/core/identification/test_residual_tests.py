@@ -1,5 +1,7 @@
 """Residual tests with known outcome, and the paper's Fig. 9."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal, stats
@@ -75,6 +77,19 @@ def test_a_wrong_model_shows_where_the_axis_moves():
     tests = residual_tests(problem, static, steps)
     assert tests.chi_square > 5
     assert tests.independence < 1e-9
+
+
+@pytest.mark.parametrize("noise", [0.5e-9, 1.5e-9])
+def test_rounding_that_rests_hide_is_no_misfit(noise):
+    """Readings in steps of 10 nm scatter by 2.9 nm where they move, and hardly where they rest."""
+    quantum, (problem, steps) = 10e-9, stepped(0.0005, noise)
+    rounded = np.round(problem.output / quantum) * quantum
+    resting = np.where(steps.moving, -1, 0)
+    problem = replace(problem, output=rounded, plateau=resting, shared=1e-18, reading_step=quantum)
+    found = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    tests = residual_tests(problem, found, steps)
+    assert tests.noise == pytest.approx(quantum / np.sqrt(12), rel=0.15)
+    assert tests.chi_square == pytest.approx(1.0, abs=0.25)
 
 
 def test_fig_9_of_the_paper():

@@ -1,0 +1,62 @@
+"""A sine in time or in position is found at its own frequency, and once."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.departures.families import DRIFT, PERIODIC, VIBRATION
+from omsm_ros.core.departures.survey import Survey
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.output_error import fit
+from omsm_ros.core.fitting.preparation import prepare
+from omsm_ros.core.identification.departure_search import search
+from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+
+PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
+STEPS = StepTest()
+TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
+Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
+
+
+def prepared_of(added, seed=1):
+    random = np.random.default_rng(seed)
+    seen = -LATE + added + random.normal(0, NOISE, len(TIME))
+    z = Z + random.normal(0, 0.3e-9, len(Z))
+    return prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder")
+
+
+def best(added, family):
+    prepared = prepared_of(added)
+    late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
+    return Survey(prepared.problem, late, prepared.steps, (family,)).best[family]
+
+
+@pytest.mark.parametrize("frequency", [2.033, 13.711, 120.04])
+def test_a_line_is_found_between_the_lines_of_the_record(frequency):
+    """Within the bound of Cramér and Rao times four, far below the 0.1 Hz between lines."""
+    size = 20e-9
+    found = best(size * np.sin(2 * np.pi * frequency * TIME + 0.4), VIBRATION)
+    bound = np.sqrt(6 / len(TIME)) * NOISE / size / (np.pi * STEPS.duration)
+    assert found.significant
+    assert found.term.parameter == pytest.approx(frequency, abs=4 * bound)
+    assert np.linalg.norm(found.score.size) == pytest.approx(size, rel=0.05)
+
+
+@pytest.mark.parametrize("period", [2.413e-6, 7.03e-6])
+def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
+    size = 20e-9
+    searched = search(prepared_of(size * np.sin(2 * np.pi * LATE / period + 1.0)), model_from_start)
+    found = [b.term.parameter for b in searched.beside if b.term.family == PERIODIC]
+    assert len(found) == 1
+    assert found[0] == pytest.approx(period, rel=0.01)
+
+
+@pytest.mark.parametrize("periods", [1.0, 3.7])
+def test_what_wanders_too_slowly_for_a_line_is_a_drift(periods):
+    """Lines begin at four periods over the record; up to there a drift leaves nothing of it."""
+    wandering = 100e-9 * np.sin(2 * np.pi * periods * TIME / TIME[-1] + 0.3)
+    searched = search(prepared_of(wandering), model_from_start)
+    assert {b.term.family for b in searched.beside} == {DRIFT}
+    assert searched.unmodelled == []
+    assert searched.model.chosen.fit.rms == pytest.approx(NOISE, rel=0.03)
