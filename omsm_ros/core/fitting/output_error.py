@@ -54,7 +54,6 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
-    reading_step: between neighbouring values of the readings [m], 0 if there is none
     """
 
     input: FloatArray
@@ -67,7 +66,6 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
-    reading_step: float = 0.0
 
     @cached_property
     def closed_length(self) -> int:
@@ -174,19 +172,15 @@ class Problem:
         """Spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         terms = len(fitted.numerator)
-        return np.asarray(
-            fitted.driven[:terms] @ self._driven(fitted.structure, lag)[:terms], np.complex128
-        )
+        driven = self._driven(fitted.structure, lag)[:terms]
+        return np.asarray(fitted.driven[:terms] @ driven, np.complex128)
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""
-        moved = fft.irfft(self.answer(fitted), self.closed_length)[: len(self.input)]
-        return np.asarray(moved + self.background @ fitted.background)
-
-    def answer(self, fitted: Fit) -> ComplexArray:
-        """Spectrum of what the fitted model makes of all that drives it, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
-        return np.asarray(fitted.driven @ self._driven(fitted.structure, lag))
+        spectrum = fitted.driven @ self._driven(fitted.structure, lag)
+        moved = fft.irfft(spectrum, self.closed_length)[: len(self.input)]
+        return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
         """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""

@@ -71,9 +71,8 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
     """The problem with what the steps of the probe's readings leave open on plateaus."""
     plateau, seen = plateaus(steps, problem.used), problem.output[problem.used]
-    step = reading_step(seen)
-    shared = plateau_variance(seen, plateau[problem.used], step)
-    return replace(problem, plateau=plateau, shared=shared, reading_step=step)
+    shared = plateau_variance(seen, plateau[problem.used], reading_step(seen))
+    return replace(problem, plateau=plateau, shared=shared)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:

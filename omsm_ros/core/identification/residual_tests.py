@@ -15,6 +15,7 @@ from scipy import fft, stats
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.reading_steps import reading_step
 from omsm_ros.core.fitting.steps import Steps
 from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -52,13 +53,13 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
     on_grid[problem.used] = fitted.residual
     active = problem.used & _active(steps, problem.period)
     noise = max(_noise(on_grid, problem.used, problem.used & ~active), _FINEST_READING_M)
-    crossing = problem.used & (np.abs(np.gradient(problem.input)) > problem.reading_step)
-    if problem.shared > 0 and np.sum(crossing) >= _LEAST_CROSSINGS:
+    step = reading_step(problem.output[problem.used]) if problem.shared > 0 else 0.0
+    crossing = problem.used & (np.abs(np.gradient(problem.input)) > step)
+    if step > 0 and np.sum(crossing) >= _LEAST_CROSSINGS:
         # Readings that hardly change at rest do not tell the noise: rounding holds it. Where the
         # axis crosses a step from sample to sample, it scatters over the whole step.
         active = crossing
-        rounding = problem.reading_step / np.sqrt(12.0)
-        noise = max(noise, rounding, _noise_of_neighbours(on_grid[crossing]))
+        noise = max(noise, step / np.sqrt(12.0), _noise_of_neighbours(on_grid[crossing]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     timing = scatter_in_time(problem, fitted.residual)

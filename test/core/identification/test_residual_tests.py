@@ -85,7 +85,7 @@ def test_rounding_that_rests_hide_is_no_misfit(noise):
     quantum, (problem, steps) = 10e-9, stepped(0.0005, noise)
     rounded = np.round(problem.output / quantum) * quantum
     resting = np.where(steps.moving, -1, 0)
-    problem = replace(problem, output=rounded, plateau=resting, shared=1e-18, reading_step=quantum)
+    problem = replace(problem, output=rounded, plateau=resting, shared=1e-18)
     found = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     tests = residual_tests(problem, found, steps)
     assert tests.noise == pytest.approx(quantum / np.sqrt(12), rel=0.15)
