@@ -171,9 +171,8 @@ class Problem:
     def moved(self, fitted: Fit) -> ComplexArray:
         """Spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
-        terms = len(fitted.numerator)
-        driven = self._driven(fitted.structure, lag)[:terms]
-        return np.asarray(fitted.driven[:terms] @ driven, np.complex128)
+        driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
+        return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """What the fitted model says is seen, at every sample, (n,)."""
