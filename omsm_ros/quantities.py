@@ -169,6 +169,10 @@ SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
 PITCH = Quantity("pitch", "rad", -1.0, 1.0, "give it in radians")
 MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
 SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
+# As many as the largest camera of an interferometer has, 3.4 k × 3.4 k; 0.7 GB while they are read.
+MAP_POINTS = Quantity(
+    "number of points", "", 1, 12_000_000, "write their true number, or thin them", whole=True
+)
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 
 # --------------------------------------------------------------------------- uncertainty

@@ -181,6 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
+    except MemoryError as err:
+        _say(f"memory is short: {err or 'none is left'}; give less at once")
+        return BAD_INPUT
     except Exception as err:
         if os.environ.get(DEBUG):
             raise

@@ -56,9 +56,10 @@ def _table(source: Path, units: LengthUnits | None) -> NDArray[np.void]:
     """All columns of a cloud of ours; of another file those that every format has."""
     file = source / CLOUD if source.is_dir() else source
     try:
-        return CloudFile(file).read()
-    except (FileError, OSError):
+        cloud = CloudFile(file)
+    except FileError:
         return _records(read_points(file, units))
+    return cloud.read()
 
 
 def _records(points: MeasuredPoints) -> NDArray[np.void]:

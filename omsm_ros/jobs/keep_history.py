@@ -14,6 +14,7 @@ import numpy as np
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.verification.trend import Trend, trend
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import COUNTER, SIGNAL
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.catalogue import Catalogue, time_of
@@ -54,8 +55,7 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
     path = folder / SUMMARY
     text = read_text(path, _MAX_SUMMARY_BYTES, FileError, "summary")
     summary = strict_json.object_of(text, FileError, f"summary {str(path)!r}")
-    stream = _part(summary, "samples", "distance") or {}
-    settings = summary.get("settings") or {}
+    settings = _object(_part(summary, "settings"))
     source = bag if bag is not None else Path(str(summary.get("bag", "")))
     place = str(folder.absolute())
     row = {
@@ -67,8 +67,8 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
         "version": str(_part(summary, "versions", "omsm_ros") or ""),
         "settings": strict_json.text_of(settings),
         "calibration": str(summary.get("calibration", "")),
-        "received": stream.get("received"),
-        "corrected": stream.get("corrected"),
+        "received": _count(_part(summary, "samples", "distance", "received")),
+        "corrected": _count(_part(summary, "samples", "distance", "corrected")),
         "deviation_rms": _number(_part(summary, "deviation", "corrected", "rms_area_weighted")),
         "deviation_peak_to_valley": _number(
             _part(summary, "deviation", "corrected", "peak_to_valley")
@@ -142,7 +142,16 @@ def _machine(settings: Mapping[str, object]) -> str:
 
 
 def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and np.isfinite(value) else None
+    known = isinstance(value, int | float) and abs(value) <= SIGNAL.high
+    return float(value) if known else None  # type: ignore[arg-type]
+
+
+def _count(value: object) -> int | None:
+    return value if isinstance(value, int) and 0 <= value <= COUNTER.high else None
+
+
+def _object(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _part(content: Mapping[str, Any], *names: str) -> Any:

@@ -73,7 +73,7 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
         )
     try:
         cloud = CloudFile(file)
-    except (FileError, OSError):
+    except FileError:
         points = read_points(file, units)
         whole = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
         return Measurement(lambda: [whole], (), False, points.notes, as_grid(points) is not None)

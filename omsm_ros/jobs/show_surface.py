@@ -14,6 +14,7 @@ from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.slopes import gradient_of
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import SAMPLE_PERIOD
 from omsm_ros.storage.files import save_bytes
 from omsm_ros.units import RPM_HZ
 
@@ -96,8 +97,8 @@ def _over_disc(
 
 
 def _path(surface: Surface, scan: Scan) -> ScanPath:
-    period = 1 / (abs(scan.speed) * RPM_HZ * _SAMPLES_PER_TURN)
     spiral = Spiral(surface, scan.radius, scan.feed, scan.speed)
+    period = max(1 / (abs(scan.speed) * RPM_HZ * _SAMPLES_PER_TURN), SAMPLE_PERIOD.low)
     turns = min(_TURNS * _SAMPLES_PER_TURN, int(spiral.duration / period))
     axes = spiral.positions(np.arange(max(turns, 100)) * period)
     return ScanPath(z=axes.z, sample_period=period, x=axes.x, c=axes.c)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints, pack_points
 from omsm_ros.errors import FileError
-from omsm_ros.storage.files import whole_file
+from omsm_ros.quantities import POSITION
+from omsm_ros.storage.files import open_regular, whole_file
 
 # --------------------------------------------------------------------------------- cloud
 
@@ -47,12 +50,11 @@ class PlyWriter:
         return packed
 
     def _header(self) -> bytes:
-        lines = ["ply", "format binary_little_endian 1.0", f"comment {self._comment}"]
-        lines += [f"element vertex {self.points}"]
-        lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
-        text = "\n".join(lines) + "\n"
+        lines = _header_lines(self.points)
+        lines.insert(2, f"comment {self._comment}".encode("ascii", "replace"))
+        text = b"\n".join(lines) + b"\n"
         padding = _PLY_HEADER_BYTES - len(text) - len("comment \nend_header\n")
-        return f"{text}comment {' ' * padding}\nend_header\n".encode("ascii", "replace")
+        return text + b"comment " + b" " * padding + b"\nend_header\n"
 
     def __exit__(
         self,
@@ -66,6 +68,13 @@ class PlyWriter:
         self._file.__exit__(kind, error, trace)
 
 
+def _header_lines(points: int) -> list[bytes]:
+    """What the header of every cloud of ours says, but for comments."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}"]
+    lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
+    return [line.encode("ascii") for line in lines]
+
+
 class CloudFile:
     """Our own ``cloud.ply``, read in portions: memory does not depend on its length.
 
@@ -74,21 +83,32 @@ class CloudFile:
 
     def __init__(self, path: Path | str) -> None:
         self._path = Path(path)
-        with self._path.open("rb") as stream:
-            head, mark, _ = stream.read(_PLY_HEADER_BYTES).partition(b"end_header\n")
-        if not head.startswith(b"ply\n") or not mark:
-            raise FileError(f"{str(path)!r} is not a PLY file of ours")
-        vertices = [line for line in head.splitlines() if line.startswith(b"element vertex")]
-        self.points = int(vertices[0].split()[2]) if vertices else -1
-        if self._path.stat().st_size != _PLY_HEADER_BYTES + self.points * _PLY_DTYPE.itemsize:
-            raise FileError(f"{str(path)!r} is not one of our clouds, or was cut short")
+        with self._opened() as stream:
+            head = stream.read(_PLY_HEADER_BYTES)
+            held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
+        self.points = max(held, 0) // _PLY_DTYPE.itemsize
+        told = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
+        if told != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:
+            raise FileError(
+                f"{str(path)!r} is none of our clouds, or was cut short; correct the scan again"
+            )
+
+    def _opened(self) -> IO[bytes]:
+        return open_regular(self._path, FileError, "cloud")
 
     def portions(self, size: int = 500_000) -> Iterator[NDArray[np.void]]:
-        """Yield all points in order, ``size`` at a time, as structured arrays of the contract."""
-        with self._path.open("rb") as stream:
+        """Yield all points in order, ``size`` at a time, as structured arrays of the contract.
+
+        Raises FileError for coordinates that are no numbers, or further off than any machine goes.
+        """
+        with self._opened() as stream:
             stream.seek(_PLY_HEADER_BYTES)
             while raw := stream.read(size * _PLY_DTYPE.itemsize):
-                yield np.frombuffer(raw, _PLY_DTYPE)
+                rows = np.frombuffer(raw, _PLY_DTYPE)
+                for name in ("x", "y", "height"):
+                    what = f"cloud {str(self._path)!r}: {name}"
+                    POSITION.checked_all(rows[name], FileError, what)
+                yield rows
 
     def read(self, most: int | None = None) -> NDArray[np.void]:
         """All points, or evenly every k-th so that there are no more than ``most``."""

@@ -80,8 +80,8 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
     part: Path | None = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.is_dir():
-            raise IsADirectoryError(None, "it is a folder")
+        if target.exists() and not target.is_file():  # replacing /dev/null would break the machine
+            raise FileExistsError(None, "it is a folder, a device or a pipe")
         part = beside(target)
         with open(part, mode, opener=_new_file) as stream:
             yield stream

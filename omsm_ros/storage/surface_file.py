@@ -24,6 +24,9 @@ from omsm_ros.storage.files import read_text
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 
 MAX_YAML_BYTES = 100_000
+# Every shape is evaluated at every point; what is in a turned frame, by Newton's method, some five
+# times for once, and so twenty-five times where its frame is turned in another one.
+MOST_SHAPES, MOST_FRAMES = 50, 3
 _GRID = "grid"
 _INTEGER: Mapping[str, Any] = {"type": "integer"}
 _LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
@@ -33,7 +36,24 @@ def load_surface(path: Path | str) -> Surface:
     """Read ``SURFACE.yaml``; SurfaceError if it is malformed."""
     text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
     what = f"surface {str(path)!r}"
-    return surface_of(strict_yaml.mapping_of(text, SurfaceError, what), what, Path(path).parent)
+    description = strict_yaml.mapping_of(text, SurfaceError, what)
+    shapes, frames = _extent(description)
+    if shapes > MOST_SHAPES or frames > MOST_FRAMES:
+        raise SurfaceError(
+            f"{what} has {shapes} shapes and {frames} turned frames within one another, expected "
+            f"at most {MOST_SHAPES} and {MOST_FRAMES}; describe it by a grid"
+        )
+    return surface_of(description, what, Path(path).parent)
+
+
+def _extent(content: Any) -> tuple[int, int]:
+    """Return how many shapes a description has, and how many frames are turned in one another."""
+    named = content if isinstance(content, dict) else {}
+    inside = named.values() if named else content if isinstance(content, list) else ()
+    known = [_extent(part) for part in inside]
+    shapes = sum(count for count, _ in known) + ("shape" in named)
+    turned = ("pose" in named) + ("parent" in named)
+    return shapes, turned + max((depth for _, depth in known), default=0)
 
 
 def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = None) -> Surface:

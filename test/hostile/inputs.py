@@ -6,7 +6,6 @@ import json
 import math
 from typing import Any
 
-from hostile.judge import Case
 from hypothesis import strategies as st
 
 from omsm_ros.core.dynamics.calibration import content_id
@@ -148,87 +147,3 @@ def motion_texts(draw: st.DrawFn) -> bytes:
         )
     text = "\n".join(lines).encode("utf-8", "surrogatepass")
     return draw(damaged(text)) if draw(st.integers(0, 5)) == 0 else text
-
-
-# -------------------------------------------------------------------------------- arguments
-
-PATHS = st.sampled_from([
-    "scan.mcap", "cal.json", "surface.yaml", "geometry.yaml", "motion.csv", "missing", "pipe",
-    "pipe.mcap", "folder", "folder/x", "/dev/zero", "/dev/full", "/dev/null", "zero.mcap",
-    "n" * 300, "n" * 300 + ".mcap", "n" * 5000, "", ".", "..", "/", "a\0b", "\udcff", "cal.json/x",
-    "/proc/self/mem", "/etc/passwd", "loop", "--", "-x", "%s%n",
-])  # fmt: skip
-_FLAGS = {
-    "inspect": [],
-    "predict": ["--calibration", "--budget", "--limits"],
-    "correct": [
-        "--calibration", "--out", "--nominal", "--geometry", "--lateral-lag", "--sources",
-        "--lateral", "--settings", "--by-stamps", "--delay", "--exposure", "--polarity",
-        "--override", "--counter-offset", "--stamp-tolerance",
-    ],
-    "reversal": ["--calibration", "--out"],
-    "align": ["--calibration", "--radius", "--geometry", "--out"],
-    "plan": ["--out", "--sample-period", "--step", "--count", "--dwell", "--rise", "--half-range"],
-    "verify": ["--calibration"],
-    "compare": [],
-    "validate": ["--input", "--output", "--out"],
-    "selfcal": [
-        "--calibration", "--out", "--harmonics", "--clocking", "--polarity", "--static-gain",
-        "--gain-uncertainty", "--settings",
-    ],
-    "latency": ["--delay", "--uncertainty", "--reason", "--out"],
-}  # fmt: skip
-_POSITIONALS = {"plan": 1, "reversal": 2, "compare": 2, "selfcal": 2, "validate": 2}
-_FIRST = {"plan": "steps", "compare": "cal.json", "latency": "cal.json", "validate": "model.json"}
-_SWITCHES = {"--by-stamps", "--override"}
-_GOOD = {
-    "--calibration": "cal.json",
-    "--out": "out",
-    "--radius": "0.1",
-    "--delay": "1e-4",
-    "--uncertainty": "1e-5",
-    "--reason": "datasheet",
-}
-_FILES = {"--calibration", "--out", "--nominal", "--geometry", "--limits"}
-
-
-@st.composite
-def arguments(draw: st.DrawFn) -> Case:
-    """A command line whose words are right or anything."""
-    command = draw(st.sampled_from(sorted(_FLAGS)))
-    words = [command]
-    for _ in range(_POSITIONALS.get(command, 1)):
-        good = _FIRST.get(command, "scan.mcap")
-        words.append(draw(st.one_of(st.just(good), PATHS)))
-    needed = [flag for flag in _FLAGS[command] if flag in _GOOD]
-    others = draw(st.lists(st.sampled_from(_FLAGS[command] or ["--json"]), max_size=3))
-    for flag in dict.fromkeys([*needed, *others]):
-        words.append(flag)
-        if flag not in _SWITCHES and flag != "--json":
-            words.append(_GOOD.get(flag, "") if flag in needed and draw(st.integers(0, 3))
-                         else draw(_value_of(flag)))  # fmt: skip
-    if draw(st.integers(0, 9)) == 0:
-        words.insert(draw(st.integers(0, len(words))), draw(TEXTS))
-    if command == "correct":
-        words.append("--no-report")
-    return Case((*words, "--json"))
-
-
-_SETTING_NAMES = st.sampled_from(
-    ["probe_noise", "pitch", "machine", "static_gain", "table_mass_kg", "lag_is_latency"]
-)
-SETTINGS = st.one_of(
-    st.dictionaries(st.one_of(_SETTING_NAMES, TEXTS), VALUES, max_size=3).map(json.dumps),
-    st.tuples(_SETTING_NAMES, NUMBERS).map(lambda pair: json.dumps(dict([pair]))),
-    VALUES.map(json.dumps),
-    TEXTS,
-    st.just("[" * 5000),
-)
-
-
-def _value_of(flag: str) -> st.SearchStrategy[str]:
-    if flag in _FILES:
-        return PATHS
-    if flag in ("--settings", "--sources"):
-        return SETTINGS
-    return st.one_of(NUMBERS.map(str), NUMBERS.map(repr), TEXTS)

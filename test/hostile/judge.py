@@ -25,7 +25,8 @@ REMEDIES = (
     "check", "expected", "give", "use", "record", "identify", "write", "see", "call", "make",
     "move", "remove", "sample", "look", "plan", "choose", "leave", "convert", "start", "both are",
     "are needed", "reverse", "scan at", "name columns", "at least", "more than", "set the", "needs",
-    "must",
+    "must", "state ", "thin it", "save it", "name the", "name each", "measure", "hold what",
+    "widen", "split it", "import the parts",
 )  # fmt: skip
 
 
@@ -39,6 +40,7 @@ class Case:
     def lay(self, folder: Path) -> None:
         """Write the files into ``folder``."""
         for name, content in self.files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.form.figures import Figure
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import DataError
 
 _NOISE_SEED = 21
 # An S-filter below this many cells would pass what cells fold; beyond it half a sine passes.
@@ -29,15 +30,24 @@ class Bands:
 
 
 def bands_of(cells: Cells, s_filter: float | None = None, l_filter: float | None = None) -> Bands:
-    """Return the wavelengths asked for, or else three cells, and a quarter of the longest side."""
+    """Return the wavelengths asked for, or else three cells, and a quarter of the longest side.
+
+    Raises DataError where the two leave nothing between them.
+    """
     across = max(cells.present.shape) * cells.pitch
     shortest = max(s_filter or 0.0, _LEAST_CELLS * cells.pitch)
+    longest = l_filter or _DEFAULT_L * across
+    if l_filter is not None and longest <= shortest:
+        raise DataError(
+            f"L-filter of {longest!r} m leaves nothing beside the S-filter of {shortest!r} m, as "
+            "the points allow it; give a longer --l-filter, or measure more points"
+        )
     ends = {
         name: (None if long == np.inf else long * across, max(short * across, shortest))
         for name, (long, short) in _BANDS.items()
     }
     found = {name: (long, short) for name, (long, short) in ends.items() if (long or 1e9) > short}
-    return Bands(shortest, l_filter or _DEFAULT_L * across, found)
+    return Bands(shortest, longest, found)
 
 
 @dataclass(frozen=True, eq=False)

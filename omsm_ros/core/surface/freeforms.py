@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval2d
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import Asphere, checked_terms, curvature_of, root_of
@@ -53,19 +54,26 @@ class XYPolynomial:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height [m] at x, y [m]."""
-        u, v = np.asarray(x) / self.radius, np.asarray(y) / self.radius
-        zero = np.zeros(np.broadcast(u, v).shape)
-        return np.asarray(sum((t.value * u**t.x * v**t.y for t in self.terms), zero))
+        return self._at(x, y, self._coefficients())
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Slopes ∂z/∂x, ∂z/∂y [1]."""
-        u, v = np.asarray(x) / self.radius, np.asarray(y) / self.radius
-        along_x, along_y = (np.zeros(np.broadcast(u, v).shape) for _ in range(2))
-        for t in self.terms:
-            size = t.value / self.radius
-            along_x += size * t.x * u ** max(t.x - 1, 0) * v**t.y
-            along_y += size * t.y * u**t.x * v ** max(t.y - 1, 0)
-        return along_x, along_y
+        along_x, along_y = (
+            np.asarray(polyder(self._coefficients(), axis=k) / self.radius, np.float64)
+            for k in range(2)
+        )
+        return self._at(x, y, along_x), self._at(x, y, along_y)
+
+    def _coefficients(self) -> FloatArray:
+        """Return the value [m] of each pair of powers (i, j); terms of equal powers add up."""
+        table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
+        for term in self.terms:
+            table[term.x, term.y] += term.value
+        return table
+
+    def _at(self, x: FloatArray, y: FloatArray, coefficients: FloatArray) -> FloatArray:
+        u, v = np.broadcast_arrays(np.asarray(x) / self.radius, np.asarray(y) / self.radius)
+        return np.asarray(polyval2d(u, v, coefficients), np.float64)
 
 
 @dataclass(frozen=True, slots=True)

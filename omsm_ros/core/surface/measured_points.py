@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
-from omsm_ros.quantities import POSITION
+from omsm_ros.quantities import COUNTER, POSITION, UNCERTAINTY
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -43,6 +45,10 @@ class MeasuredPoints:
             raise DataError("a surface of no points; give one that has heights")
         for name, column in columns.items():
             POSITION.checked_all(column, DataError, name)
+        if self.uncertainty is not None:
+            UNCERTAINTY.checked_all(self.uncertainty, DataError, "uncertainty")
+        if self.sample is not None:
+            COUNTER.checked_all(self.sample, DataError, "sample")
 
     def __len__(self) -> int:
         return len(self.x)
@@ -66,14 +72,18 @@ def measured(
     height: FloatArray,
     uncertainty: FloatArray | None = None,
     notes: tuple[str, ...] = (),
+    *,
+    sample: NDArray[Any] | None = None,
 ) -> MeasuredPoints:
     """Return the points (n,) [m] whose height is a number; those that have none are counted."""
     known = np.isfinite(height)
+    order = None if sample is None else COUNTER.checked_all(sample[known], DataError, "sample")
     return MeasuredPoints(
         x=np.ascontiguousarray(x[known], np.float64),
         y=np.ascontiguousarray(y[known], np.float64),
         height=np.ascontiguousarray(height[known], np.float64),
         uncertainty=None if uncertainty is None else np.asarray(uncertainty[known], np.float64),
+        sample=None if order is None else order.astype(np.int64),
         missing=int(np.sum(~known)),
         notes=notes,
     )

@@ -18,7 +18,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.core.surface.slopes import gradient_of, unit_normal
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, SurfaceError
 
 FREEDOMS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
@@ -71,10 +71,19 @@ class Placement:
     power: float = 0.0
 
     def moved(self, freedoms: Sequence[str], step: FloatArray) -> Placement:
-        """Return the placement after a ``step`` (p,) of its ``freedoms``."""
+        """Return the placement after a ``step`` (p,) of its ``freedoms``.
+
+        Raises DataError where no part of the machine could sit: a fit strayed.
+        """
         changes = dict(zip(freedoms, map(float, step), strict=True))
         power = self.power + changes.pop("power", 0.0)
-        pose = replace(self.pose, **{k: getattr(self.pose, k) + v for k, v in changes.items()})
+        try:
+            pose = replace(self.pose, **{k: getattr(self.pose, k) + v for k, v in changes.items()})
+        except SurfaceError as err:
+            raise DataError(
+                "no pose brings the points onto the nominal surface; check its parameters, the "
+                "sign of its radii and the units of the cloud, or fit fewer freedoms"
+            ) from err
         return Placement(pose, power)
 
     def value(self, freedom: str) -> float:

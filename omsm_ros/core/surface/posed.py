@@ -204,5 +204,8 @@ class Sum:
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Slopes ∂z/∂x, ∂z/∂y [1]."""
-        slopes = [gradient_of(part, x, y) for part in self.parts]
-        return np.asarray(sum(s[0] for s in slopes)), np.asarray(sum(s[1] for s in slopes))
+        along_x, along_y = gradient_of(self.parts[0], x, y)
+        for part in self.parts[1:]:
+            more = gradient_of(part, x, y)
+            along_x, along_y = along_x + more[0], along_y + more[1]
+        return along_x, along_y

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, whole_file
 from omsm_ros.storage.maps.length_units import LengthUnits, name_and_unit, needed
 from omsm_ros.storage.table_file import rows_in
 
-# Twenty million lines of three numbers.
-MAX_TEXT_BYTES = 2_000_000_000
+# As many points as a map may have, in lines of sixty characters.
+MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
 _COMMENTS = ("#", "!", "%")
 _LONGEST_HEADER, _LONGEST_LINE = 50, 10_000
 _ROLES = {
@@ -52,14 +53,21 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         table = _numbers(body, len(header), _delimiter(first), sorted(names.values()), what)
     at = {name: sorted(names.values()).index(place) for name, place in names.items()}
     column = {name: table[:, place] * scales[name] for name, place in at.items()}
-    return _points(column, _notes(names, first))
+    return measured(
+        column["x"],
+        column["y"],
+        column["height"],
+        column.get("uncertainty"),
+        _notes(names, first),
+        sample=column.get("sample"),
+    )
 
 
 def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
     """Return the lines before the first line of numbers, and that line."""
     header: list[str] = []
     for raw in islice(iter(lambda: stream.readline(_LONGEST_LINE), b""), _LONGEST_HEADER):
-        line = raw.decode("utf-8", "replace").strip()
+        line = _decoded(raw).strip()
         if line and not line.startswith(_COMMENTS) and _all_numbers(line):
             return header, line
         header.append(line)
@@ -67,6 +75,13 @@ def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
         f"{what} has no line of numbers among its first {_LONGEST_HEADER}; give a text with a "
         "column each for x, y and height"
     )
+
+
+def _decoded(raw: bytes) -> str:
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:  # a µ as Windows writes it
+        return raw.decode("latin-1")
 
 
 def _all_numbers(line: str) -> bool:
@@ -91,7 +106,7 @@ def _columns(
     places = {role: place for role, (place, _) in named.items()}
     if not named:
         if count < 3:
-            raise FileError(f"{what} has {count} columns, expected x, y and height")
+            raise FileError(f"{what} has {count} columns, expected x, y and height in each line")
         places = {"x": 0, "y": 1, "height": 2}
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
@@ -136,22 +151,6 @@ def _numbers(
 def _notes(names: Mapping[str, int], first: str) -> tuple[str, ...]:
     count = len([part for part in re.split(r"[,;\s]+", first) if part])
     return (f"{count - len(names)} other columns were left out",) if count > len(names) else ()
-
-
-def _points(column: Mapping[str, FloatArray], notes: tuple[str, ...]) -> MeasuredPoints:
-    points = measured(column["x"], column["y"], column["height"], column.get("uncertainty"), notes)
-    if "sample" not in column:
-        return points
-    order = column["sample"][np.isfinite(column["height"])].astype(np.int64)
-    return MeasuredPoints(
-        x=points.x,
-        y=points.y,
-        height=points.height,
-        uncertainty=points.uncertainty,
-        sample=order,
-        missing=points.missing,
-        notes=notes,
-    )
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv: bool) -> None:

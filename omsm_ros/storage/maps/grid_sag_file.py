@@ -15,10 +15,10 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, whole_file
 from omsm_ros.storage.table_file import rows_in
 
-MAX_GRID_POINTS = 50_000_000
 _UNITS_M = (1e-3, 1e-2, 0.0254, 1.0)
 _METRES = 3
 _COMMENT = "!"
@@ -58,11 +58,12 @@ def read_grid_sag(path: Path) -> HeightGrid:
                 "decentres"
             )
         columns, rows = int(first[0]), int(first[1])
-        if columns * rows > MAX_GRID_POINTS:
-            raise FileError(f"{what} says {columns * rows} points, at most {MAX_GRID_POINTS}")
+        MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
         table = rows_in(text, what, "write a line a point", comments=_COMMENT)
     if len(table) != columns * rows:
-        raise FileError(f"{what} says {columns} × {rows} points and has {len(table)}; cut short?")
+        raise FileError(
+            f"{what} says {columns} × {rows} points and has {len(table)}; write it again"
+        )
     return _grid(first, table)
 
 

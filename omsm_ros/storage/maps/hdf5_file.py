@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, said, whole_file
 from omsm_ros.storage.maps.length_units import metres_in
 from omsm_ros.storage.maps.optional import library
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 SCHEMA = "omsm-points/1"
-_MOST_POINTS = 50_000_000
 _NO_LENGTHS = ("sample", "intensity")
 _DATX_SURFACES = "Data/Surface"
 
@@ -40,7 +41,7 @@ def read_hdf5(path: Path) -> MeasuredPoints:
         except (OSError, KeyError, TypeError, IndexError, ValueError, RuntimeError) as err:
             if isinstance(err, FileError):
                 raise
-            raise FileError(f"{what} cannot be read: {said(err)}; is it cut short?") from err
+            raise FileError(f"{what} cannot be read: {said(err)}; write it again") from err
     raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
 
 
@@ -49,22 +50,20 @@ def _table(content: Any, what: str) -> MeasuredPoints:
     for name in ("x", "y", "height", "uncertainty", "sample"):
         if name in content:
             column[name] = _array(content[name], what, 1)
-    known = np.isfinite(column["height"])
-    points = measured(column["x"], column["y"], column["height"], column.get("uncertainty"))
-    return MeasuredPoints(
-        x=points.x,
-        y=points.y,
-        height=points.height,
-        uncertainty=points.uncertainty,
-        sample=column["sample"][known].astype(np.int64) if "sample" in column else None,
-        missing=points.missing,
+    return measured(
+        column["x"],
+        column["y"],
+        column["height"],
+        column.get("uncertainty"),
+        sample=column.get("sample"),
     )
 
 
 def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
     shape = getattr(dataset, "shape", ())
-    if len(shape) != axes or np.prod(shape, dtype=float) > _MOST_POINTS:
-        raise FileError(f"{what} holds heights of shape {shape!r}; at most {_MOST_POINTS} are read")
+    if len(shape) != axes:
+        raise FileError(f"{what} holds an array of shape {shape!r}, expected {axes} of them")
+    MAP_POINTS.checked(math.prod(shape), FileError, f"{what}: number of points")
     return np.asarray(dataset[()])
 
 
@@ -75,7 +74,7 @@ def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
     group = content[_DATX_SURFACES]
     surfaces = [group[name] for name in group if isinstance(group[name], h5py.Dataset)]
     if not surfaces:
-        raise FileError(f"{what} holds no surface")
+        raise FileError(f"{what} holds no surface; save it with one")
     surface = surfaces[0]
     height = _array(surface, what, 2).astype(np.float64)
     no_data = surface.attrs.get("No Data")

@@ -13,12 +13,12 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular
 
 MAGIC = b"\x88\x1b\x03"
 _HEADER_BYTES = 834
 _LARGEST_HEADER = 65_536
-_MOST_POINTS = 50_000_000
 # Phase values from here on say why there is none.
 _NO_DATUM = 2_147_483_640
 # Steps of the phase in one fringe, by the entry "phase resolution".
@@ -36,18 +36,19 @@ def read_metropro(path: Path) -> MeasuredPoints:
     with open_regular(path, FileError, "MetroPro file") as stream:
         head = stream.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES or not head.startswith(MAGIC):
-            raise FileError(f"{what} has no header of MetroPro; is it cut short?")
+            raise FileError(f"{what} has no header of MetroPro, or was cut short; save it again")
         size = _at(">I", head, 6)
         columns, rows = _at(">H", head, 68), _at(">H", head, 70)
         before = _at(">H", head, 52) * _at(">H", head, 54) * _at(">H", head, 56) * 2
-        if not columns * rows or columns * rows > _MOST_POINTS or size > _LARGEST_HEADER:
-            raise FileError(f"{what} says that it has {columns} × {rows} points of phase")
+        if size > _LARGEST_HEADER:
+            raise FileError(f"{what} says that its header has {size} bytes; save it again")
+        MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
         stream.seek(size + before)
         raw = stream.read(4 * columns * rows)
         held = stream.seek(0, io.SEEK_END)
     if len(raw) < 4 * columns * rows:
         raise FileError(
-            f"{what} has {held} bytes, too few for {columns} × {rows} points; it was cut short"
+            f"{what} has {held} bytes, too few for {columns} × {rows} points; save it again"
         )
     phase = np.frombuffer(raw, ">i4").reshape(rows, columns).astype(np.float64)
     return _points(head, phase, what)

@@ -41,7 +41,7 @@ def _head(path: Path) -> bytes:
     with open_regular(path, FileError, "map") as stream:
         head = stream.read(_HEAD_BYTES)
     if not head:
-        raise FileError(f"map {str(path)!r} is empty")
+        raise FileError(f"map {str(path)!r} is empty; write it again")
     if head.startswith(_BAG):
         raise FileError(
             f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "

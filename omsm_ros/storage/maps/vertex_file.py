@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import MAP_POINTS, shown
 from omsm_ros.storage.files import open_regular, said, whole_file
 from omsm_ros.storage.maps.length_units import LengthUnits, needed
 from omsm_ros.storage.table_file import rows_in
 
-MAX_CLOUD_BYTES = 4_000_000_000
 IN_METRES = "lengths in metres"
 """What a comment of ours says of the coordinates."""
 
@@ -74,7 +73,9 @@ def _header(stream: IO[bytes], last: str, what: str) -> list[str]:
         lines.append(raw.decode("ascii", "replace").strip())
         if lines[-1].startswith(last):
             return lines
-    raise FileError(f"{what} has no end of its header ({last.strip()!r}); is it cut short?")
+    raise FileError(
+        f"{what} has no end of its header ({last.strip()!r}), or was cut short; write it again"
+    )
 
 
 def _ply_vertices(lines: Sequence[str], order: str, what: str) -> tuple[np.dtype[np.void], int]:
@@ -93,14 +94,16 @@ def _pcd_points(entries: Mapping[str, Sequence[str]], what: str) -> tuple[np.dty
     names, sizes, kinds = (entries.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts = entries.get("COUNT", ["1"] * len(names))
     if not len(names) == len(sizes) == len(kinds) == len(counts) or set(counts) - {"1"}:
-        raise FileError(f"{what}: FIELDS, SIZE, TYPE and COUNT do not fit each other")
+        raise FileError(
+            f"{what}: FIELDS, SIZE, TYPE and COUNT do not fit each other; write it again"
+        )
     try:
         fields = [
             (name, f"<{_PCD_KINDS[kind]}{int(size)}")
             for name, size, kind in zip(names, sizes, kinds, strict=True)
         ]
     except (KeyError, ValueError) as err:
-        raise FileError(f"{what} has fields of unknown type: {said(err)}") from err
+        raise FileError(f"{what} has fields of unknown type: {said(err)}; write numbers") from err
     return _dtype(fields, what), _count(entries.get("POINTS", []), what)
 
 
@@ -108,16 +111,18 @@ def _dtype(fields: list[tuple[str, str]], what: str) -> np.dtype[np.void]:
     try:
         dtype = np.dtype(fields)
     except (TypeError, ValueError) as err:
-        raise FileError(f"{what} has fields that cannot be read: {said(err)}") from err
+        raise FileError(
+            f"{what} has fields that cannot be read: {said(err)}; name each once"
+        ) from err
     if not {"x", "y"} <= set(dtype.names or ()) or not {"z", "height"} & set(dtype.names or ()):
         raise FileError(f"{what} has the fields {shown(dtype.names)}, expected x, y and z")
     return dtype
 
 
 def _count(text: Sequence[str], what: str) -> int:
-    if len(text) != 1 or not text[0].isdecimal() or len(text[0]) > 12 or not int(text[0]):
-        raise FileError(f"{what} says that it has {shown(' '.join(text))} points")
-    return int(text[0])
+    said = " ".join(text)
+    count = int(said) if said.isascii() and said.isdecimal() and len(said) <= 12 else said
+    return int(MAP_POINTS.checked(count, FileError, f"{what}: number of points"))
 
 
 def _records(
@@ -127,16 +132,18 @@ def _records(
     held = stream.seek(0, io.SEEK_END) - begin
     stream.seek(begin)
     least = 2 * len(dtype) * count if ascii_text else dtype.itemsize * count
-    if held < least - 1 or held > MAX_CLOUD_BYTES:
+    if held < least - 1:
         raise FileError(
-            f"{what} says that it has {count} points and holds {held} bytes of them; "
-            "it was cut short, or is longer than is read"
+            f"{what} says that it has {count} points and holds {held} bytes of them; it was cut "
+            "short, write it again"
         )
     if not ascii_text:
         return np.frombuffer(stream.read(least), dtype)
     columns = rows_in(stream, what, "write a line a point", max_rows=count).T
     if columns.shape != (len(dtype), count):
-        raise FileError(f"{what} says {count} points of {len(dtype)} numbers; it was cut short")
+        raise FileError(
+            f"{what} says {count} points of {len(dtype)} numbers; it was cut short, write it again"
+        )
     return np.rec.fromarrays(columns, names=list(dtype.names or ()))
 
 
@@ -146,25 +153,16 @@ def _points(
     names = table.dtype.names or ()
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
     scale = LengthUnits(1.0, 1.0) if ours else needed(units, what)
-    column = {name: table[name].astype(np.float64) for name in names if name != "sample"}
+    with np.errstate(invalid="ignore"):  # of bytes that are a NaN of the signalling kind
+        column = {name: table[name].astype(np.float64) for name in names if name != "sample"}
     height = column.get("height", column.get("z"))
     spread = column.get("uncertainty") if ours else None
-    points = measured(
+    return measured(
         column["x"] * scale.lateral,
         column["y"] * scale.lateral,
         np.asarray(height) * scale.height,
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
-    )
-    if not (ours and "sample" in names):
-        return points
-    known = np.isfinite(np.asarray(height))
-    return MeasuredPoints(
-        x=points.x,
-        y=points.y,
-        height=points.height,
-        uncertainty=points.uncertainty,
-        sample=table["sample"][known].astype(np.int64),
-        missing=points.missing,
+        sample=table["sample"] if ours and "sample" in names else None,
     )
 
 

@@ -15,11 +15,12 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
+from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, said, whole_file
 from omsm_ros.storage.maps.optional import library
 
-# Fifty million heights of eight bytes, unpacked.
-MAX_UNPACKED_BYTES = 400_000_000
+# All points that are read, in eight bytes each, and what describes them.
+MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
 
 
 def read_x3p(path: Path) -> MeasuredPoints:
@@ -35,7 +36,8 @@ def read_x3p(path: Path) -> MeasuredPoints:
                 size = sum(member.file_size for member in archive.infolist())
             if size > MAX_UNPACKED_BYTES:
                 raise FileError(
-                    f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read"
+                    f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
+                    "thin it"
                 )
             stream.seek(0)
             content = x3pio.read(stream)
@@ -43,7 +45,7 @@ def read_x3p(path: Path) -> MeasuredPoints:
         except (x3pio.X3pError, zipfile.BadZipFile, ValueError, OSError, EOFError) as err:
             if isinstance(err, FileError):
                 raise
-            raise FileError(f"{what} cannot be read: {said(err)}") from err
+            raise FileError(f"{what} cannot be read: {said(err)}; save it again") from err
     layers = len(content.layers)
     notes = (f"the first of its {layers} layers",) if layers > 1 else ()
     return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)

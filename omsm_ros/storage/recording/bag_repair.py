@@ -5,6 +5,7 @@ Every whole chunk whose checksum fits, copied message by message into a new bag 
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -51,9 +52,9 @@ def repair(path: Path) -> Repair:
     if not parts:
         raise BagError(
             f"{str(path)!r} holds no .mcap file; only MCAP is repaired here, "
-            "for sqlite3 try 'ros2 bag reindex'"
+            "for sqlite3 use 'ros2 bag reindex'"
         )
-    made = Repair(path.resolve().with_name(f"{path.resolve().stem}.repaired.mcap"))
+    made = Repair(_beside(path))
     with open_regular(parts[0], BagError, "bag") as stream:
         _check_magic(stream, parts[0])
     file = new_bag_file(made.path)
@@ -67,6 +68,11 @@ def repair(path: Path) -> Repair:
     finally:
         file.close()
     return made
+
+
+def _beside(path: Path) -> Path:
+    whole = Path(os.path.abspath(path))
+    return whole.with_name(f"{whole.stem}.repaired.mcap")
 
 
 def _number(part: Path) -> tuple[int, str]:

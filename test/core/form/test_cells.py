@@ -7,6 +7,7 @@ from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.form.figures import DeviationMap
 from omsm_ros.core.form.power_density import power_density
 from omsm_ros.core.form.texture import bands_of, texture
+from omsm_ros.errors import DataError
 
 SIDE = 20e-3
 
@@ -86,6 +87,8 @@ def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
     assert bands_of(cells, 1e-3, 8e-3).l_filter == 8e-3
     assert bands_of(cells, 1e-3, 8e-3).s_filter == 1e-3
     assert bands_of(cells, 1e-9).s_filter == 3 * cells.pitch
+    with pytest.raises(DataError, match="leaves nothing beside the S-filter"):
+        bands_of(cells, 8e-3, 8e-3)
 
 
 # ---------------------------------------------------------------------- spectral densities

@@ -76,7 +76,7 @@ def test_an_inverted_sign_is_told(tmp_path):
         (metropro(np.zeros((2, 2)), pixel=float("nan")), "no lateral calibration"),
         (metropro(np.zeros((2, 2)), resolution=9), "how high a fringe is"),
         (metropro(np.full((2, 2), NO_DATUM)), "no points"),
-        (metropro(np.zeros((0, 0))), "0 × 0 points"),
+        (metropro(np.zeros((0, 0))), "number of points is 0"),
     ],
 )
 def test_a_metropro_file_that_cannot_be_scaled_is_refused(tmp_path, raw, told):
@@ -283,7 +283,7 @@ def test_a_pcd_of_a_viewer(tmp_path, form):
             PLY.replace("vertex 3", "vertex 99999999999")
             .format(form="binary_little_endian")
             .encode(),
-            "99999999999 points and holds 0 bytes",
+            "expected a whole number from 1 to",
         ),
         ("a.ply", PLY.replace("uchar red", "list uchar red").format(form="ascii").encode(), "more"),
         ("a.pcd", PCD.format(form="binary_compressed").encode(), "write it as binary"),
