@@ -324,7 +324,7 @@ def test_a_pickle_is_not_opened(tmp_path):
         ("columns: {q: {name: d, unit: um}}\nsample_period: 1", "'q' is unknown"),
         ("columns: {distance: {name: d, unit: um, constant: 0}}\nsample_period: 1", "one of them"),
         ("columns: {x: {constant: 3}}\nsample_period: 1", "x has no unit"),
-        ("columns: {}\nsample_period: 1", "nothing to import"),
+        ("columns: {}\nsample_period: 1", "write one of them into the map"),
         ("columns: {distance: {name: d, unit: um}}\nsample_period: 1e9", "sample_period"),
         ('columns: {distance: {name: d, unit: um}}\nsample_period: 1\ndecimal: ","', "fraction"),
     ],

@@ -124,7 +124,7 @@ class ColumnMap:
                 f"start is {self.start:g} s, but the column of time holds dates; leave start out"
             )
         if not {"z", "distance"} & set(self.columns):
-            raise DataError("neither z nor distance has a column; there is nothing to import")
+            raise DataError("neither z nor distance has a column; write one of them into the map")
         lacking = [a for a in AXES if a not in self.columns]
         if "z" in self.columns and lacking:
             raise DataError(

@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,8 +153,7 @@ def _points(
     names = table.dtype.names or ()
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
     scale = LengthUnits(1.0, 1.0) if ours else needed(units, what)
-    with np.errstate(invalid="ignore"):  # of bytes that are a NaN of the signalling kind
-        column = {name: table[name].astype(np.float64) for name in names if name != "sample"}
+    column = {name: _quiet(table[name]) for name in names if name != "sample"}
     height = column.get("height", column.get("z"))
     spread = column.get("uncertainty") if ours else None
     return measured(
@@ -164,6 +163,14 @@ def _points(
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
         sample=table["sample"] if ours and "sample" in names else None,
     )
+
+
+def _quiet(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return floats (n,) without NaN of the signalling kind, which damaged bytes may be."""
+    with np.errstate(invalid="ignore"):
+        found = values.astype(np.float64)
+    found[np.isnan(found)] = np.nan
+    return found
 
 
 # ------------------------------------------------------------------------------- writing
