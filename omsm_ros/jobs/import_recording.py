@@ -160,8 +160,8 @@ class _Source:
         lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
         if lacking:
             raise FileError(
-                f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together and "
-                "come from one file"
+                f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together: "
+                "give them in one file"
             )
         self._check_units()
         self._check_period()

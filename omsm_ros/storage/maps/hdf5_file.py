@@ -38,9 +38,9 @@ def read_hdf5(path: Path) -> MeasuredPoints:
                     return _table(content, what)
                 if _DATX_SURFACES in content:
                     return _datx(h5py, content, what)
-        except (OSError, KeyError, TypeError, IndexError, ValueError, RuntimeError) as err:
-            if isinstance(err, FileError):
-                raise
+        except FileError:
+            raise
+        except Exception as err:  # whatever the library makes of a damaged file
             raise FileError(f"{what} cannot be read: {said(err)}; write it again") from err
     raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
 

@@ -42,9 +42,9 @@ def read_x3p(path: Path) -> MeasuredPoints:
             stream.seek(0)
             content = x3pio.read(stream)
             place = _places(x3pio, content)
-        except (x3pio.X3pError, zipfile.BadZipFile, ValueError, OSError, EOFError) as err:
-            if isinstance(err, FileError):
-                raise
+        except FileError:
+            raise
+        except Exception as err:  # whatever zip, XML and heights make of a damaged file
             raise FileError(f"{what} cannot be read: {said(err)}; save it again") from err
     layers = len(content.layers)
     notes = (f"the first of its {layers} layers",) if layers > 1 else ()
