@@ -100,7 +100,7 @@ def fit_zernikes(
         disc=disc,
         terms=used,
         coefficients=found[:, 0],
-        covariance=inverse @ scores @ inverse,
+        covariance=_no_less(*(inverse @ each @ inverse for each in scores)),
         left_out=tuple(t for t in terms if t not in used),
         effects=found[:, 1:],
     )
@@ -146,15 +146,17 @@ def _scores(
     disc: Aperture,
     weights: FloatArray | None,
     inverse: FloatArray,
-) -> FloatArray:
-    """Return the covariance (k, k) of columns times residual, by groups of successive points.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (k, k) of columns times residual, by groups and by single points.
+
+    Groups are of successive points, whose errors may hang together.
 
     inverse: of the Gram matrix (k, k). The fit follows each group's errors by the group's share of
     that matrix, so that its residuals are too small; they are taken as the fit to all other groups
     leaves them (delete-a-group jackknife; R. Bell, D. McCaffrey, Surv. Methodol. 28, 169).
     """
     size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * len(terms) else 1
-    total = np.zeros((len(terms), len(terms)))
+    together, single = np.zeros((2, len(terms), len(terms)))
     for begin in range(0, len(x), CHUNK):
         chunk = slice(begin, begin + CHUNK)
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
@@ -162,13 +164,25 @@ def _scores(
         weighted = columns if weights is None else columns * weights[chunk]
         edges = np.arange(0, columns.shape[1], size)
         lengths = np.diff(edges, append=columns.shape[1])
-        sums = np.add.reduceat(weighted * residual, edges, axis=1)
+        products = weighted * residual
+        single += products @ products.T
+        sums = np.add.reduceat(products, edges, axis=1)
         followed = sums
         for _ in range(_FOLLOWED):
             back = np.repeat(inverse @ followed, lengths, axis=1)
             followed = np.add.reduceat(weighted * np.sum(columns * back, axis=0), edges, axis=1)
             sums = sums + followed
-        total += sums @ sums.T
+        together += sums @ sums.T
     groups = max(-(-len(x) // size), 2)
     freedom = max(1 - len(terms) / len(x), 1e-3)
-    return np.asarray(total * groups / (groups - 1) / freedom, np.float64)
+    return together * groups / (groups - 1) / freedom, single / freedom
+
+
+def _no_less(covariance: FloatArray, floor: FloatArray) -> FloatArray:
+    """Return the covariance (k, k), no variance below that of the ``floor``.
+
+    Few groups lie at the rim: by chance they may state far too little.
+    """
+    ratio = np.diag(floor) / np.maximum(np.diag(covariance), np.finfo(np.float64).tiny)
+    more = np.sqrt(np.maximum(ratio, 1.0))
+    return np.asarray(covariance * np.outer(more, more), np.float64)

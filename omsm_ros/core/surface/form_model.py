@@ -40,6 +40,8 @@ _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
 # a hundredth of the radius has two.
 _NEARLY_A_DISC = 10.0
 _TURNS, _SETTLED = 300, 1e-3
+# Sizes of optical figure errors fall with the second to fourth power of their order.
+_STEEPEST = 4
 # Beneath a picometre a form error is of no interest, and a variance of zero has no inverse; nor
 # beneath a tenth of the variance that noise leaves of a term, for nothing could tell it.
 _LEAST_M = 1e-12
@@ -234,7 +236,23 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
         if each != _RINGS:
             value = above = max(value, above)
         new[chosen] = value
-    return new
+    return _falling(new, group)
+
+
+def _falling(sizes: FloatArray, group: IntArray) -> FloatArray:
+    """Return the variances (k,), none falling steeper with order than parts do.
+
+    A shift of an asphere is coma and nothing else: what coma there may be cannot be read off
+    trefoil alone.
+    """
+    held, below = sizes.copy(), 0.0
+    for each in range(2, HIGHEST_ORDER + 1):
+        chosen = group == each
+        below *= ((each - 1) / each) ** (2 * _STEEPEST)
+        if np.any(chosen):
+            below = max(below, float(held[chosen].max()))
+            held[chosen] = below
+    return held
 
 
 def limit_of(residual: FloatArray) -> float:

@@ -175,6 +175,18 @@ def test_the_stated_uncertainty_holds_what_the_form_of_the_part_does_to_the_pose
     assert np.sqrt(np.mean(off**2)) > 0.05
 
 
+def test_coma_of_an_asphere_is_a_shift_and_the_uncertainty_holds_it():
+    """Moved sideways an asphere shows coma alone; trefoil, which it has none of, does not tell."""
+    nominal = Asphere(0.08, -1.2, (0.0, 20.0))
+    pose = Pose(x=2e-4, y=-3e-4, tip=2e-3)
+    error = ZernikeSurface(RADIUS, (0, 0, 0, 0, 30e-9, 40e-9, 10e-9, -11e-9))
+    for seed in range(2):
+        found = fitted(nominal, scan(Part(nominal, error), pose, seed=seed), "piston,tip,tilt,x,y")
+        for name in ("x", "y"):
+            off = found.placement.value(name) - getattr(pose, name)
+            assert abs(off) < 2 * found.uncertainty(name)
+
+
 def test_what_is_not_determined_widens_what_follows_it():
     """Clocking of an off-axis paraboloid about its parent's axis, 50.8 mm away."""
     pose = Pose(clocking=5e-3)
