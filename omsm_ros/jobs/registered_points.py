@@ -99,12 +99,12 @@ class _OfPose:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (POSE,) * (len(self.found.pose_effects) + len(self.found.held_effects))
+        return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
 
     def at(self, first: int, count: int) -> FloatArray:
         """Fields (p, count) [m] of the kept points from ``first`` on."""
         part = _slice(self.at_, first, count)
-        none = np.zeros((self.found.moved.shape[1] - len(self.found.held_effects), len(part.x)))
+        none = np.zeros((self.found.moved.shape[1] - 2 * len(self.found.held_effects), len(part.x)))
         pose, sources = self.found.effects(part, none)
         return np.concatenate([pose, sources[len(none) :]])
 

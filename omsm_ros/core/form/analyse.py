@@ -94,7 +94,7 @@ def analyse_form(
             gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
     bounded = [n for n, name in enumerate(sources) if name in bounds]
     # What is held may be where it should: how far off it is at most is all that is known.
-    bounded += range(len(sources), len(sources) + len(found.held_effects))
+    bounded += range(len(sources), found.moved.shape[1])
     map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)

@@ -8,28 +8,37 @@ from typing import NamedTuple
 
 import numpy as np
 
+from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.form_model import FormBasis
 from omsm_ros.core.surface.freedoms import Freedoms, widest
-from omsm_ros.core.surface.placement import Aperture, Placed, Placement, freedom_columns
+from omsm_ros.core.surface.placement import (
+    Aperture,
+    Placed,
+    Placement,
+    Portion,
+    freedom_columns,
+    placed,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Registration:
     """How the part sits, and how well that is known.
 
-    placement: of the part;  freedoms: what was fitted, and what could not be
+    surface: the nominal;  placement: of the part;  freedoms: what was fitted, and what could not be
     from_source: standard uncertainty of each (p,) by where it comes from
     pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
     held_effects: the same of those that are held (h, h), as far as the points bound them
     moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
-        then by how much what is held does (p, s + h)
+        then by how much what is held does (p, s + 2h)
     spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
     limit: deviation from the smooth form beyond which a point is an outlier [m]
     disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
     """
 
+    surface: Surface
     placement: Placement
     freedoms: Freedoms
     from_source: dict[str, FloatArray]
@@ -49,15 +58,14 @@ class Registration:
         return self.spread.get(freedom)
 
     def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the pose (p, n) and the sources (s + h, n) may do to the deviations [m].
+        """Return what the pose (p, n) and the sources (s + 2h, n) may do to the deviations [m].
 
-        systematic: effects on the heights (s, n), which the pose then follows. The last h of the
+        systematic: effects on the heights (s, n), which the pose then follows. The last 2h of the
         sources are the freedoms that were held.
         """
         columns = freedom_columns(self.placement, points, self.freedoms.fitted)
-        held = self.held_effects @ freedom_columns(
-            self.placement, points, tuple(self.freedoms.held)
-        )
+        names = tuple(self.freedoms.held)
+        held = effects_of_held(self.surface, self.placement, points, names, self.held_effects)
         sources = np.concatenate([systematic * points.normal[2], held])
         return self.pose_effects @ columns, sources + self.moved.T @ columns
 
@@ -65,6 +73,25 @@ class Registration:
         """Return which points (n,) are no outliers."""
         smooth = self.form @ self.basis.columns(points.x, points.y)
         return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
+
+
+def effects_of_held(
+    surface: Surface, at: Placement, points: Placed, names: Sequence[str], steps: FloatArray
+) -> FloatArray:
+    """Return what ``steps`` (h, h) of freedoms that were held do to the deviations (2h, n) [m].
+
+    Of each the first and the second order: what is held may be off by tenths of a millimetre.
+    """
+    there = points.from_origin + at.pose.origin[:, np.newaxis]
+    portion = Portion(there[0], there[1], there[2], np.empty((0, len(points.x))))
+    rows = np.zeros((2 * len(steps), len(points.x)))
+    for k, step in enumerate(steps):
+        high, low = (
+            placed(surface, at.moved(names, side * step), portion).deviation for side in (1, -1)
+        )
+        rows[2 * k], rows[2 * k + 1] = (high - low) / 2, (high + low) / 2 - points.deviation
+    # At the rim a step may leave the surface.
+    return np.nan_to_num(rows, copy=False)
 
 
 class Open(NamedTuple):

@@ -41,7 +41,7 @@ from omsm_ros.core.surface.placement import (
     selection,
     usable,
 )
-from omsm_ros.core.surface.pose_budget import Open, Registration, root_of
+from omsm_ros.core.surface.pose_budget import Open, Registration, effects_of_held, root_of
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
 
@@ -218,10 +218,9 @@ class _Fit:
             if self.aperture is not None:
                 good &= self.aperture.holds(whole.x, whole.y)
             points = whole.part(good)
-            held = freedom_columns(at, points, tuple(self.freedoms.held))
-            systematic = np.concatenate(
-                [part.systematic[:, good] * points.normal[2], held_effects @ held]
-            )
+            names = tuple(self.freedoms.held)
+            held = effects_of_held(self.surface, at, points, names, held_effects)
+            systematic = np.concatenate([part.systematic[:, good] * points.normal[2], held])
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-freedom_columns(at, points, self.names), z])
             residual = points.deviation - like @ columns
@@ -277,7 +276,7 @@ def _over_all(
 ) -> Registration:
     """Return the registration by all points, from one pass over them at a pose that stands."""
     free, held = len(fit.names), root_of(open_.held)
-    sums = fit.new_sums(len(sources) + len(held))
+    sums = fit.new_sums(len(sources) + 2 * len(held))
     square = points = 0.0
     for portion in portions():
         fit.sums(stand, portion, held, sums)
@@ -289,8 +288,9 @@ def _over_all(
     # A source that is off by its standard uncertainty moves the pose by one of these columns.
     moved = gain @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
-    by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * len(held)), moved)
+    by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * 2 * len(held)), moved)
     return Registration(
+        surface=fit.surface,
         placement=stand.at.moved(fit.names, found.step),
         freedoms=fit.freedoms,
         from_source=by_source,

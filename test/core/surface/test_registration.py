@@ -219,7 +219,7 @@ def test_a_move_that_form_looks_like_is_held_and_may_do_what_is_stated():
     columns = freedom_columns(Placement(), points, names).T
     left = points.deviation - columns @ np.linalg.lstsq(columns, points.deviation, rcond=None)[0]
     opened = found.effects(points, np.empty((0, len(there.x))))[1]
-    assert opened.shape == (2, len(there.x))
+    assert opened.shape == (4, len(there.x))
     assert np.sqrt(np.mean(left**2)) < 2 * np.sqrt(np.mean(np.sum(opened**2, axis=0)))
 
 
