@@ -24,6 +24,7 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 from omsm_ros.readable import quantity
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 MOST_ACROSS = 200
 """Places across the map of a difference."""
@@ -171,7 +172,27 @@ def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]
             f"{', '.join(sideways)} were fitted: a true difference that looks like such a move is "
             "not seen",
         )
+    found += _beside_each_other(matched)
     return found + tuple(f"{name} was not fitted: {why}" for name, why in matched.refused.items())
+
+
+def _beside_each_other(matched: Matched) -> tuple[str, ...]:
+    """What a small shift between the two would do to heights that are steep."""
+    there = matched.from_b
+    each = {"x": there.slope_x, "y": there.slope_y}
+    slopes = [slope for name, slope in each.items() if name not in matched.freedoms]
+    if not slopes:
+        return ()
+    left = matched.without_fit(np.stack(slopes))
+    opened = MICROMETRE_M * float(np.sqrt(np.max(np.mean(left**2, axis=1))))
+    if opened < NANOMETRE_M:
+        return ()
+    height = quantity(float(np.ptp(matched.a)), "m")
+    return (
+        f"whole heights were compared, of {height} PV: where one part lies a micrometre beside the "
+        f"other they differ by {quantity(opened, 'm', 2)} rms; to compare deviations, each in the "
+        "frame of its part, give --nominal SURFACE.yaml --register auto",
+    )
 
 
 def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:

@@ -20,7 +20,8 @@ from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.readable import quantity
 
 FREEDOMS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
-"""In this order; tip turns about y (height grows with x), tilt about x."""
+"""In this order, with the signs of a pose: tip raises the side of +y, tilt lowers that of +x,
+clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
 _SIDEWAYS = ("x", "y", "clocking")
@@ -29,6 +30,9 @@ _SETTLED = 1e-3
 _FEWEST_PLACES = 100
 # A freedom whose column the others explain but for this share is none of its own.
 _LEAST_OWN_SHARE = 1e-3
+# Of a column's square that is of the surface: Gauss-Newton with more noise than that in its
+# slopes takes too short a step, and does not settle.
+_LEAST_RELIABLE = 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -93,7 +97,7 @@ def match(
     wanted = freedoms_named(freedoms)
     moved = dict.fromkeys(wanted, 0.0)
     seen = places.seen(moved, wanted)
-    refused = _not_determined(seen.columns, grid.dx)
+    refused = _not_determined(seen.columns, places.columns_of_first(seen.filled, wanted), grid.dx)
     left = tuple(name for name in wanted if name not in refused)
     for _ in range(_TURNS):
         seen = places.seen(moved, left)
@@ -151,6 +155,11 @@ class _Places:
         heights = (self._here.value[filled], there.value[filled])
         return _Seen(filled, *heights, columns, there, u[filled], v[filled])
 
+    def columns_of_first(self, filled: BoolArray, freedoms: Sequence[str]) -> dict[str, FloatArray]:
+        """What each freedom would do to the first measurement where both have heights (n,)."""
+        here, x, y = _part(self._here, filled), self.x[filled], self.y[filled]
+        return {name: _column(name, x, y, here) for name in freedoms}
+
     def matched(
         self, seen: _Seen, moved: dict[str, float], step: dict[str, float], refused: dict[str, str]
     ) -> Matched:
@@ -194,30 +203,45 @@ def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> Flo
         return np.ones_like(x)
     if name == "clocking":
         return np.asarray(y * there.slope_x - x * there.slope_y, np.float64)
-    columns = {"tip": x, "tilt": y, "power": x**2 + y**2, "x": -there.slope_x, "y": -there.slope_y}
+    columns = {
+        "tip": y, "tilt": -x, "power": (x**2 + y**2) / 2, "x": -there.slope_x, "y": -there.slope_y,
+    }  # fmt: skip
     return columns[name]
 
 
-def _not_determined(columns: dict[str, FloatArray], place: float) -> dict[str, str]:
-    """Which freedoms sideways the surface does not tell from the others, and why."""
+def _not_determined(
+    columns: dict[str, FloatArray], of_first: dict[str, FloatArray], place: float
+) -> dict[str, str]:
+    """Which freedoms sideways the surface does not tell from the others, and why.
+
+    columns, of_first: of the second and of the first measurement. What both have in common is of
+    the surface; the rest is the noise of their slopes, which tells nothing.
+    """
     refused: dict[str, str] = {}
     for name in _SIDEWAYS:
         if name not in columns:
             continue
-        others = [c for n, c in columns.items() if n != name and n not in refused]
-        design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]
-        own = columns[name] - design @ np.linalg.lstsq(design, columns[name], rcond=1e-10)[0]
+        others = [n for n in columns if n != name and n not in refused]
+        own, first = (_own(of[name], [of[n] for n in others]) for of in (columns, of_first))
         share = float(np.linalg.norm(own)) / max(float(np.linalg.norm(columns[name])), 1e-300)
         # By one place, or by what that is at the rim: a smaller change nobody would see.
         reach = place if name != "clocking" else 1e-2
-        effect = float(np.sqrt(np.mean(own**2))) * reach
-        if share < _LEAST_OWN_SHARE or effect < 1e-10:
+        common = max(float(np.mean(own * first)), 0.0)
+        effect = np.sqrt(common) * reach
+        noisy = common < _LEAST_RELIABLE * float(np.mean(own**2))
+        if share < _LEAST_OWN_SHARE or effect < 1e-10 or noisy:
             refused[name] = (
                 "the surface looks alike wherever it is: moved by "
                 f"{quantity(reach, 'rad' if name == 'clocking' else 'm', 2)} it changes by "
-                f"{quantity(effect, 'm', 1)}"
+                + (f"{quantity(effect, 'm', 1)}" if effect > 1e-12 else "nothing beyond noise")
             )
     return refused
+
+
+def _own(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
+    """The part of a column (n,) that the others do not explain."""
+    design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]
+    return np.asarray(column - design @ np.linalg.lstsq(design, column, rcond=1e-10)[0])
 
 
 def _small(sideways: dict[str, float], place: float, extent: float) -> bool:

@@ -173,9 +173,10 @@ def test_piston_tip_tilt_and_power_are_taken_off_and_told():
     assert found.verdict.verdict == AGREE
     moved = found.matched.moved
     assert moved["piston"] == pytest.approx(-4e-6, abs=1e-9)
-    assert moved["tip"] == pytest.approx(-30e-6, abs=1e-7)
-    assert moved["tilt"] == pytest.approx(20e-6, abs=1e-7)
-    assert moved["power"] == pytest.approx(-1e-3, abs=1e-4)
+    # As a pose has it: tip raises the side of +y, tilt lowers that of +x, power is a curvature.
+    assert moved["tip"] == pytest.approx(20e-6, abs=1e-7)
+    assert moved["tilt"] == pytest.approx(30e-6, abs=1e-7)
+    assert moved["power"] == pytest.approx(-2e-3, abs=2e-4)
     assert (2, 0) not in {(t.n, t.m) for t in found.agreement.terms}
 
 
@@ -201,6 +202,34 @@ def test_a_turn_that_a_surface_of_revolution_does_not_show_is_refused():
     found = compare(*sides, freedoms=(*SEATED, "x", "y", "clocking"))
     assert set(found.matched.refused) == {"x", "y", "clocking"}
     assert any("clocking was not fitted" in text for text in found.verdict.reservations)
+
+
+def test_slopes_that_are_noise_alone_tell_no_turn():
+    """With a nanometre of noise each slope has a little of its own, which no fit settles on."""
+    at, random = np.linspace(-RADIUS, RADIUS, 81), np.random.default_rng(2)
+    x, y = (part.ravel() for part in np.meshgrid(at, at))
+    sides = [
+        Measurement(name=n, common=1e-9, points=MeasuredPoints(
+            x=x, y=y, height=(x**2 + y**2) / 0.2 + random.normal(0, 10e-9, len(x))))
+        for n in "ab"
+    ]  # fmt: skip
+    found = compare(*sides, freedoms=(*SEATED, "x", "y", "clocking"))
+    assert "clocking" in found.matched.refused
+    assert found.verdict.verdict != DIFFER
+
+
+def test_steep_heights_that_were_compared_whole_are_told():
+    """Of a cylinder: moved beside its axis by a micrometre, it is higher by the micrometre's slope,
+    which a tilt takes up; a saddle of fourth order keeps it."""
+    at = np.linspace(-RADIUS, RADIUS, 61)
+    x, y = (part.ravel() for part in np.meshgrid(at, at))
+    steep = MeasuredPoints(x=x, y=y, height=1e-3 * (x / RADIUS) ** 4)
+    found = compare(*(Measurement(name=n, points=steep, common=1e-9) for n in "ab"))
+    told = [text for text in found.verdict.reservations if "whole heights" in text]
+    assert "--nominal SURFACE.yaml" in told[0]
+    flat = MeasuredPoints(x=x, y=y, height=1e-9 * (x / RADIUS) ** 4)
+    found = compare(*(Measurement(name=n, points=flat, common=1e-9) for n in "ab"))
+    assert not any("whole heights" in text for text in found.verdict.reservations)
 
 
 def test_what_does_not_lie_together_is_refused():
