@@ -69,7 +69,9 @@ class BlockStreamDevice(StreamDevice):
     def _decode(self, data: bytes) -> Samples:
         parts = []
         for block in self._decoder.feed(data):
-            self._identity |= {"order": str(block.order), "serial": str(block.serial)}
+            self._identity = {
+                "order": str(block.order), "serial": str(block.serial), **self._identity,
+            }  # fmt: skip
             frames = block.frames.reshape(-1).view(self._frame(block.kind))
             counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
             parts.append(self._samples_of(frames, counter))

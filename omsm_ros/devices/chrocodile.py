@@ -42,6 +42,11 @@ TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
 FORMATS = {"binary": "BIN", "ascii": "ASC"}
 # In `TRE` the device's own rate must be just above that of the trigger.
 _ABOVE_TRIGGER = 1.05
+# Settings that a calibration belongs to; the lamp's is how long it shines within an exposure.
+_DECISIVE = {
+    "model": "model", "SEN": "head", "SHZ": "rate", "AVD": "averaging", "LAI": "lamp",
+    "SCA": "full_scale",
+}  # fmt: skip
 _COUNTER_RANGE = 2**16
 _READ_S = 0.05
 
@@ -138,6 +143,15 @@ class Chrocodile(StreamDevice):
         """Return what the device told of itself and its settings."""
         return self._identity
 
+    @property
+    def settings(self) -> dict[str, object]:
+        """Return what moves a reading in time, or makes it another: model, head, rate, lamp …"""
+        identity = self._identity
+        told = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
+        if not told:
+            return {}
+        return told | {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
+
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
         flags = {"triggers_lost": self.triggers_lost, "triggers_delayed": self.triggers_delayed}
@@ -176,6 +190,8 @@ class Chrocodile(StreamDevice):
             if value is not None:
                 self._set(name, value)
         self._read_scale()
+        for name in ("SEN", "AVD", "LAI"):
+            self._read(name)
         if not intact:
             self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
             self._tracker.begin_anew()
@@ -189,6 +205,11 @@ class Chrocodile(StreamDevice):
             return self._ask(name, *arguments)
         except RefusedError:
             return Answer(b"", "")
+
+    def _read(self, name: str) -> None:
+        """Enter a setting that was left as it is; not every model tells it."""
+        if name not in self._identity and (found := self._try(name, QUERY).numbers):
+            self._identity[name] = " ".join(f"{number:g}" for number in found)
 
     def _set(self, name: str, *values: float) -> None:
         """Set and read back; DeviceError if the device has other values then."""
@@ -269,6 +290,14 @@ class Chrocodile(StreamDevice):
             self.triggers_lost += int(np.sum((flags & TRIGGER_LOST) > 0))
             self.triggers_delayed += int(np.sum((flags & TRIGGER_DELAYED) > 0))
         return samples
+
+
+def _value(text: str) -> object:
+    """A number, where the text is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bool:

@@ -155,13 +155,19 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         )
         self._wanted = settings
 
+    @property
+    def settings(self) -> dict[str, object]:
+        """Return which controller it is, and its rate, where there is a command port."""
+        told = self._identity
+        return {name: told[name] for name in ("name", "article", "serial", "rate") if name in told}
+
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return confocal_dtype(kind, self._wanted.intensity_first)
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
         identity = _info(port.ask("GETINFO", "\n"))
         self._set_rate(port)
-        return identity
+        return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
 
     def _set_rate(self, port: CommandPort) -> None:
         wanted = 1 / (self._wanted.sample_period * _KILOHERTZ)

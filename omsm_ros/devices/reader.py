@@ -56,8 +56,11 @@ class DeviceReader:
         deliver: Callable[[Sequence[BlockPair]], None],
         note: Callable[[str], None] = lambda _: None,
         back_off: tuple[float, float] = BACK_OFF_S,
+        connected: Callable[[], None] = lambda: None,
     ) -> None:
-        """note: told once of each new trouble, and when it is over."""
+        """note: told once of each new trouble, and when it is over
+        connected: called when the device was set up, before its samples are delivered
+        """
         self.state = State.CONNECTING
         self.trouble = "not connected yet"
         self.connections = 0
@@ -65,6 +68,7 @@ class DeviceReader:
         self._deliver = deliver
         self._note = note
         self._back_off = back_off
+        self._when_connected = connected
         self._requests: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
             queue.SimpleQueue()
         )
@@ -139,6 +143,7 @@ class DeviceReader:
         self.connections += 1
         self.state = State.READING
         self._tell("")
+        self._when_connected()
 
     def _hand_over(self, blocks: Sequence[BlockPair]) -> None:
         if blocks:

@@ -126,6 +126,11 @@ class StreamDevice:
         return {}
 
     @property
+    def settings(self) -> dict[str, object]:
+        """What a calibration belongs to: how the device measures, as far as it told; JSON."""
+        return {}
+
+    @property
     def trouble(self) -> str:
         """Why the samples cannot be used although the device sends them; empty if they can."""
         if self._cutter.wrong_rate:

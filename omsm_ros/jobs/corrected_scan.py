@@ -91,6 +91,7 @@ class CorrectedScan:
                 self._calibration,
                 sample_period=self.sample_period,
                 settings=self._admission.settings,
+                probe=bag.probe_settings(),
                 polarity=self._options.polarity,
             )
             self.admitted = admit(self._calibration, self.reasons, self._admission.override)

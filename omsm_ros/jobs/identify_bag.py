@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from omsm_ros.core.dynamics.calibration import settings_with
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
@@ -43,6 +46,12 @@ def motion_of_bag(
     for name, stream in (("axis", axes), ("distance", distance)):
         check_period(name, stream, faster)
     return assemble(axes, distance, *reference, trigger=trigger)  # type: ignore[arg-type]
+
+
+def settings_of_bag(path: AnyBag, stated: Mapping[str, object]) -> dict[str, object]:
+    """What a calibration from this bag belongs to: as ``stated``, and as the probe told there."""
+    with bags.BagReader(path) as bag:
+        return settings_with(stated, bag.probe_settings())
 
 
 def _beginning(blocks: list[Block], duration: float) -> list[Block]:

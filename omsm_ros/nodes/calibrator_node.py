@@ -10,23 +10,29 @@ from typing import Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import Identify
+from std_msgs.msg import String
 
 from omsm_ros import quantities
-from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.core.dynamics.calibration import (
+    REJECTED,
+    Calibration,
+    settings_with,
+    verdict_of,
+)
 from omsm_ros.core.identification.identify import Identification, identify
 from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import ConfigurationError, OmsmError
-from omsm_ros.jobs.identify_bag import motion_of_bag
+from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
-from omsm_ros.nodes.topics import MessageInfo, listen
+from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.parameters import Parameter
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_folder import CalibrationFolder
@@ -65,6 +71,8 @@ class CalibratorNode(ManagedNode):
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
         self._aside = Aside(self, undo)
         self._aside.serve(undo, Identify, "~/identify", self._on_identify)
+        self._probe: dict[str, object] = {}
+        listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         self._take_up()
 
     def activate(self, undo: ExitStack) -> None:
@@ -79,6 +87,18 @@ class CalibratorNode(ManagedNode):
         except OmsmError as err:
             self._refused[topic] += 1
             self.get_logger().warning(f"block refused: {err}", throttle_duration_sec=5.0)
+
+    def _on_probe(self, message: String, _: MessageInfo) -> None:
+        try:
+            told = conversions.probe_settings(message)
+        except OmsmError as err:
+            self.get_logger().error(f"probe settings refused: {err}", throttle_duration_sec=5.0)
+            return
+        if self._probe and told != self._probe:
+            self.get_logger().warning("the probe is set otherwise: motion before is forgotten")
+            for buffer in self._buffers.values():
+                buffer.forget()
+        self._probe = told
 
     # ------------------------------------------------------------------- what is in force
 
@@ -164,8 +184,12 @@ class CalibratorNode(ManagedNode):
             motion = partial(
                 self._live_motion, *(self._buffers[topic].recent(duration) for topic in _STREAMS)
             )
-        settings, source = self._settings, request.input or "encoder"
-        return lambda: identify(motion(), order=order, input=source, settings=settings)
+        stated, source = self._settings, request.input or "encoder"
+        if request.bag:
+            settings = partial(settings_of_bag, Path(request.bag), stated)
+        else:
+            settings = partial(settings_with, stated, [self._probe])
+        return lambda: identify(motion(), order=order, input=source, settings=settings())
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
         return motion_of_bag(

@@ -22,7 +22,12 @@ class ConfocalDriverNode(DriverNode):
 
     def __init__(self) -> None:
         super().__init__(
-            "confocal_driver", PARAMETERS, make_device, axes="axes", distance="confocal"
+            "confocal_driver",
+            PARAMETERS,
+            make_device,
+            axes="axes",
+            distance="confocal",
+            settings="probe_settings",
         )
 
     def configure(self, undo: ExitStack) -> None:

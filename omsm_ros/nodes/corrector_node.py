@@ -11,6 +11,7 @@ from typing import Any
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import LoadCalibration, PredictError
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 
 from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import Corrector
@@ -24,11 +25,11 @@ from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.correction_state import CorrectionState, light_values
-from omsm_ros.nodes.diagnostics import WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
 from omsm_ros.nodes.frames import tell_frames
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
-from omsm_ros.nodes.topics import MessageInfo, listen
+from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_file import load_calibration, load_for_others
 from omsm_ros.storage.calibration_folder import confined, since
@@ -51,12 +52,16 @@ class CorrectorNode(ManagedNode):
         self._options, self._sources = options_of(self.values), sources_of(self.values)
         self._frame = self.values["workpiece_frame"]
         self._corrector: Corrector | None = None
+        self._probe: dict[str, object] = {}
+        self._foreign = ""
+        self._overridden: tuple[str, ...] = ()
         self._state = CorrectionState()
         self._waiting: dict[str, list[Any]] = {}
         self._points = self.publish_on(undo, PointCloud2, "points")
         self._topic = CalibrationTopic(
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
+        listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         tell_frames(self, undo, self._options.geometry, self.values)
         self._aside = Aside(self, undo)
         self._aside.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
@@ -80,10 +85,16 @@ class CorrectorNode(ManagedNode):
         self._use(calibration)
         self._topic.tell(calibration, since_ns)
 
-    def _use(self, calibration: Calibration) -> None:
-        reasons = objections(
-            calibration, settings=self._settings or None, polarity=self._options.polarity
+    def _objections(self, calibration: Calibration) -> tuple[str, ...]:
+        return objections(
+            calibration,
+            settings=self._settings or None,
+            probe=[self._probe],
+            polarity=self._options.polarity,
         )
+
+    def _use(self, calibration: Calibration) -> None:
+        reasons = self._objections(calibration)
         override = self.values["override"]
         admit(calibration, reasons, override)
         corrector = Corrector(
@@ -95,8 +106,28 @@ class CorrectorNode(ManagedNode):
         self._frame = self.values["workpiece_frame"] + (_OVERRIDDEN if reasons else "")
         for reason in reasons:
             self.get_logger().warning(f"overridden: {reason}")
-        self._corrector = corrector
+        self._corrector, self._foreign, self._overridden = corrector, "", reasons
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
+
+    def _on_probe(self, message: String, _: MessageInfo) -> None:
+        """Stop correcting where the calibration belongs to a probe set otherwise; else begin."""
+        try:
+            told = conversions.probe_settings(message)
+        except OmsmError as err:
+            self._complain(f"probe settings refused: {err}")
+            return
+        if told == self._probe:
+            return
+        self._probe = told
+        known = self._topic.calibration
+        if known is None or (self._corrector and self._objections(known) == self._overridden):
+            return
+        try:
+            self._use(known)
+        except OmsmError as err:
+            self._publish_rest()
+            self._corrector, self._foreign = None, str(err)
+            self.get_logger().error(self._foreign)
 
     def _publish_rest(self) -> None:
         if self._corrector is not None:
@@ -143,7 +174,10 @@ class CorrectorNode(ManagedNode):
         self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
-            self._complain("samples come, but there is no calibration: call identify or load one")
+            self._complain(
+                self._foreign
+                or "samples come, but there is no calibration: call identify or load one"
+            )
             return
         convert = conversions.axis_block if stream == "axes" else conversions.distance_block
         try:
@@ -198,6 +232,8 @@ class CorrectorNode(ManagedNode):
         report.values["requests_waiting"] = self._aside.waiting
         if self._frame != self.values["workpiece_frame"]:
             report.add(WARN, "correcting with a calibration that does not belong (overridden)")
+        if self._foreign:
+            report.add(ERROR, self._foreign)
         if self._topic.refused:
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report

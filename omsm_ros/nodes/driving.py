@@ -10,15 +10,18 @@ from typing import Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from rclpy.publisher import Publisher
+from std_msgs.msg import String
 
+from omsm_ros.core.dynamics.calibration import PROBE
 from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.devices.blocks import BlockPair
 from omsm_ros.devices.reader import DeviceReader, State
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
 from omsm_ros.parameters import Parameter
-from omsm_ros.storage import conversions
+from omsm_ros.storage import conversions, strict_json
 
 _FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown")
 # Shorter pauses are those between two motions of a step test.
@@ -38,14 +41,20 @@ class DriverNode(ManagedNode):
         *,
         axes: str | None = None,
         distance: str | None = None,
+        settings: str | None = None,
     ) -> None:
-        """axes, distance: topics of the blocks; None = it has none."""
+        """axes, distance: topics of the blocks;  settings: of what a calibration belongs to.
+
+        None = it has none.
+        """
         frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
         if distance:
             frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
         super().__init__(name, (*parameters, *frames))
         self._make = make
         self._axes_topic, self._distance_topic = axes, distance
+        self._settings_topic = settings
+        self._settings: Publisher | None = None
         self._axes: Publisher | None = None
         self._distance: Publisher | None = None
         self._messages = conversions.ros_messages()
@@ -57,8 +66,18 @@ class DriverNode(ManagedNode):
     def configure(self, undo: ExitStack) -> None:
         """Make the device, which nobody touches yet."""
         self._device = self._make(self.values, lambda: self.get_clock().now().nanoseconds)
-        self._reader = DeviceReader(self._device, self._publish, self.get_logger().info)
+        self._reader = DeviceReader(
+            self._device,
+            self._publish,
+            self.get_logger().info,
+            connected=self._tell_settings,
+        )
         self._recent, self._flow = RecentIncrease(), Flow()
+        self._told: dict[str, object] = {}
+        if self._settings_topic:
+            self._settings = publish_on(
+                undo=undo, node=self, kind=String, topic=self._settings_topic, qos=LATCHED_QOS
+            )
         if self._axes_topic:
             self._axes = self.publish_on(undo, AxisBlock, self._axes_topic)
         if self._distance_topic:
@@ -73,6 +92,7 @@ class DriverNode(ManagedNode):
         thread.start()
 
     def _publish(self, blocks: Sequence[BlockPair]) -> None:
+        self._tell_settings()
         for axes, distance in blocks:
             if axes is not None and self._axes is not None:
                 frame = self.values["machine_frame"]
@@ -82,6 +102,16 @@ class DriverNode(ManagedNode):
                 self._distance.publish(
                     conversions.distance_message(self._messages, distance, frame)
                 )
+
+    def _tell_settings(self) -> None:
+        """Tell them before the first samples that were taken with them, and who comes later."""
+        if self._settings is None:
+            return
+        named = {"device": self.values["device"], **self._device.settings}
+        told = {f"{PROBE}{name}": value for name, value in named.items()}
+        if told != self._told:
+            self._told = told
+            self._settings.publish(String(data=strict_json.text_of(told)))
 
     def report(self) -> Report:
         """Return what became of every sample, and what is wrong now."""

@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
@@ -52,6 +53,7 @@ _TYPES = {
     topics.REFERENCE_TOPIC: DistanceBlock,
     topics.CALIBRATION_TOPIC: Calibration,
     topics.POINTS_TOPIC: PointCloud2,
+    topics.PROBE_TOPIC: String,
 }
 _NEEDED = (topics.AXES_TOPIC, topics.DISTANCE_TOPIC)
 _SAMPLES = (*_NEEDED, topics.REFERENCE_TOPIC)

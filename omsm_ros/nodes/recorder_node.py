@@ -12,6 +12,7 @@ from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlo
 from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
@@ -33,6 +34,7 @@ _TOPICS = {
     topics.ACCELERATION_TOPIC: AccelerationBlock,
     topics.CALIBRATION_TOPIC: Calibration,
     topics.POINTS_TOPIC: PointCloud2,
+    topics.PROBE_TOPIC: String,
 }
 
 _FLUSH_PERIOD_S = 0.5

@@ -37,6 +37,7 @@ from omsm_ros.storage.recording.topics import (
     CALIBRATION_TOPIC,
     DISTANCE_TOPIC,
     POINTS_TOPIC,
+    PROBE_TOPIC,
     REFERENCE_TOPIC,
     TOPIC_TYPES,
     AnyBag,
@@ -50,6 +51,7 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     ACCELERATION_TOPIC: conversions.acceleration_block,
     CALIBRATION_TOPIC: conversions.calibration,
     POINTS_TOPIC: conversions.cloud_array,
+    PROBE_TOPIC: conversions.probe_settings,
 }
 
 _BLOCKS: dict[str, type] = {
@@ -186,6 +188,16 @@ class BagReader:
         for connection, _, raw in self._raw(connections):
             topic = roles[connection.topic]
             yield topic, self._record(topic, raw)
+
+    def probe_settings(self) -> list[dict[str, object]]:
+        """Each state that the probe's driver told of itself; none where nobody recorded it."""
+        if not self.count([PROBE_TOPIC]):
+            return []
+        found: list[dict[str, object]] = []
+        for _, told in self.records(PROBE_TOPIC):
+            if told not in found:
+                found.append(told)
+        return found
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
         """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.

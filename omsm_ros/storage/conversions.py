@@ -124,6 +124,11 @@ def calibration(message: Any) -> Calibration:
     return record
 
 
+def probe_settings(message: Any) -> dict[str, object]:
+    """What a probe's driver told of itself, a JSON object in a ``std_msgs/String``."""
+    return _json_object("probe_settings", message.data)
+
+
 def _json_object(name: str, text: str) -> dict[str, object]:
     if len(text) > MAX_JSON_CHARACTERS:
         raise CalibrationError(

@@ -20,6 +20,7 @@ from omsm_ros.storage.conversions import Messages
 
 _OF_ROS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/msg/String": "string data\n",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
     "sensor_msgs/msg/PointField": (
         "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\n"

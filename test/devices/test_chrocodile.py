@@ -316,3 +316,15 @@ def test_dark_reference_is_asked_for(cell: Any) -> None:
     run.run(0.5)
     run.end()
     run.check()
+
+
+@pytest.mark.parametrize("wanted", [{}, {"averaging": 4, "lamp": 50.0}])
+def test_it_tells_what_a_calibration_belongs_to(cell: Any, wanted: dict[str, float]) -> None:
+    run = cell(replace(SIX, **wanted))
+    assert run.device.settings == {}
+    run.device.open()
+    assert run.device.settings == {
+        "model": "CHRocodile 2 emulated", "head": 0, "rate": 1000, "full_scale": 100,
+        "averaging": wanted.get("averaging", 1), "lamp": wanted.get("lamp", 100),
+        "latch": "start", "trigger": "free_run",
+    }  # fmt: skip

@@ -7,11 +7,11 @@ records them with the result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration import PROBE, Calibration
 from omsm_ros.errors import CalibrationError
 
 # Quartz clocks agree to some 1e-5; a rate is written, not measured, and differs by rounding alone.
@@ -25,6 +25,7 @@ def objections(
     *,
     sample_period: float | None = None,
     settings: Mapping[str, object] | None = None,
+    probe: Sequence[Mapping[str, object]] = (),
     polarity: int | None = None,
 ) -> tuple[str, ...]:
     """Why ``calibration`` should not be used; empty if nothing speaks against it.
@@ -32,14 +33,20 @@ def objections(
     sample_period: of the data [s];  polarity: that the correction will use
     settings: as they are now; a name that both sides know must have the same value, one that
         the calibration was made with must not be missing
+    probe: each state that the probe's driver told of itself; what both it and the calibration
+        know must agree
     """
     found = [*_certificate(calibration, polarity)]
     expected = calibration.sample_period
     if sample_period is not None and abs(sample_period - expected) > SAME_RATE * expected:
         found.append(f"sample period is {sample_period!r} s, calibrated at {expected!r} s")
     if settings is not None:
-        found += _differences(calibration.settings, settings)
-    return tuple(found)
+        stated = {n: v for n, v in calibration.settings.items() if not n.startswith(PROBE)}
+        found += _differences(stated, settings)
+    for told in probe:
+        known = {n: v for n, v in calibration.settings.items() if n in told}
+        found += _differences(known, told)
+    return tuple(dict.fromkeys(found))
 
 
 def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) -> dict[str, object]:
@@ -50,7 +57,8 @@ def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) ->
     if reasons and not override:
         raise CalibrationError(
             f"calibration {calibration.id[:12]} does not belong to these data: "
-            f"{'; '.join(reasons)}. Identify again, or override explicitly"
+            f"{'; '.join(reasons)}. Set the cell as it was, identify again, or override "
+            "explicitly"
         )
     return {"calibration": calibration.id, "objections": list(reasons), "overridden": bool(reasons)}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,9 @@ SCHEMA = "omsm-calibration/1"
 REJECTED = "rejected"
 # A difference of two covariances this little indefinite, of correlations, is rounding.
 _ROUNDING = 1e-9
+
+PROBE = "probe."
+"""Begins the names of settings that the probe's driver tells by itself."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -165,3 +168,22 @@ def content_id(content: Mapping[str, object]) -> str:
     """SHA-256 of the canonical JSON of ``content``: sorted keys, shortest exact numbers."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def settings_with(
+    stated: Mapping[str, object], probe: Sequence[Mapping[str, object]]
+) -> dict[str, object]:
+    """Return what a calibration belongs to: as ``stated``, and as the probe told of itself.
+
+    probe: each state that the probe's driver told, during the motion
+    Raises CalibrationError where they contradict each other: the motion belongs to no setting.
+    """
+    merged = dict(stated)
+    for told in probe:
+        for name, value in told.items():
+            if merged.setdefault(name, value) != value:
+                raise CalibrationError(
+                    f"setting {name} is {merged[name]!r}, then {value!r} of one motion; leave the "
+                    "probe as it is set while it is recorded, and record again"
+                )
+    return merged

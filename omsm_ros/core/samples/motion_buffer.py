@@ -40,6 +40,10 @@ class BlockBuffer(Generic[B]):
         while self._samples > self._capacity and len(self._blocks) > 1:
             self._forget(1)
 
+    def forget(self) -> None:
+        """Forget all blocks: what comes does not belong to them."""
+        self._forget(len(self._blocks))
+
     def _forget(self, blocks: int) -> None:
         for _ in range(blocks):
             samples = len(self._blocks.popleft())

@@ -16,6 +16,7 @@ REFERENCE_TOPIC = "/omsm/reference"
 ACCELERATION_TOPIC = "/omsm/acceleration"
 CALIBRATION_TOPIC = "/omsm/calibration"
 POINTS_TOPIC = "/omsm/points"
+PROBE_TOPIC = "/omsm/probe_settings"
 
 TOPIC_TYPES = {
     AXES_TOPIC: "omsm_msgs/msg/AxisBlock",
@@ -24,9 +25,10 @@ TOPIC_TYPES = {
     ACCELERATION_TOPIC: "omsm_msgs/msg/AccelerationBlock",
     CALIBRATION_TOPIC: "omsm_msgs/msg/Calibration",
     POINTS_TOPIC: "sensor_msgs/msg/PointCloud2",
+    PROBE_TOPIC: "std_msgs/msg/String",
 }
 
-LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC})
+LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC, PROBE_TOPIC})
 """Who comes later is told the last message too."""
 
 SAMPLES_DEPTH, LATCHED_DEPTH = 2000, 1

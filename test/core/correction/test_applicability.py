@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.correction.applicability import admit, objections
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration import Calibration, settings_with
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 
@@ -26,6 +26,36 @@ def calibration(**certificate: object) -> Calibration:
         settings=SETTINGS,
         certificate={"verdict": "accepted"} | certificate,
     )
+
+
+PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
+
+
+@pytest.mark.parametrize(
+    ("told", "reasons"),
+    [
+        ([], ()),
+        ([PROBE], ()),
+        ([{"probe.averaging": 4}], ()),
+        ([{"probe.lamp": 50.0}], ()),
+        ([PROBE | {"probe.averaging": 8.0}], ("probe.averaging is 8.0, calibrated with 4.0",)),
+        (
+            [PROBE, PROBE | {"probe.model": "B"}] * 2,
+            ("probe.model is 'B', calibrated with 'A'",),
+        ),
+    ],
+)
+def test_what_the_probe_tells_is_compared_where_both_know(told, reasons):
+    known = replace(calibration(), settings=SETTINGS | PROBE)
+    assert objections(known, probe=told) == reasons
+    assert objections(known, settings=SETTINGS, probe=told) == reasons
+
+
+def test_a_calibration_belongs_to_one_setting_of_the_probe():
+    assert settings_with({"machine": "A"}, []) == {"machine": "A"}
+    assert settings_with({"machine": "A"}, [PROBE, PROBE]) == {"machine": "A", **PROBE}
+    with pytest.raises(CalibrationError, match=r"averaging is 4\.0, then 8\.0 of one motion"):
+        settings_with({}, [PROBE, {"probe.averaging": 8.0}])
 
 
 def test_the_same_settings_raise_no_objection() -> None:
