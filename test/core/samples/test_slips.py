@@ -225,6 +225,21 @@ def test_jitter_and_drift_raise_no_alarm(seed: int, regressed: bool, length: int
     assert done.slipped == 0
 
 
+@pytest.mark.parametrize("seed", [2, 3, 10])
+def test_arrivals_uneven_by_20_ms_raise_no_alarm_while_clocks_learn(seed: int) -> None:
+    axes = Device(ALL, jitter=20e-3, drift=50e-6, seed=seed)
+    probe = Device(ALL, jitter=20e-3, drift=-50e-6, seed=seed + 999)
+    assert set(join(axes.blocks(), probe.blocks()).slips) == {0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_samples_are_found_within_a_second_of_uneven_arrivals(seed: int) -> None:
+    axes = Device(ALL[:5000], jitter=1e-3, seed=seed)
+    probe = Device(without(ALL[:5000], 3000, 2), jitter=1e-3, seed=seed + 999)
+    wrong = join(axes.blocks(), probe.blocks()).wrong
+    assert 0 < len(wrong) <= 1000
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_at_70_khz_it_says_what_it_cannot_tell(seed: int) -> None:
     period = 1 / 70e3
