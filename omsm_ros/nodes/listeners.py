@@ -106,14 +106,17 @@ class Listeners:
     # --------------------------------------------------------------------------- asking
 
     def look(self) -> None:
-        """Hear what they have answered, and ask again who has not taken everything."""
+        """Hear what they have answered, and ask again who had not taken everything."""
         now = time.monotonic()
         if now - self._looked >= _LOOK_AROUND_S:
             self._looked = now
             self._look_around(now)
         for name, each in list(self._listeners.items()):
-            self._hear(each, now)
-            if each.asked is None and (not each.taken or any(self._open(each).values())):
+            self._hear(name, each, now)
+            waiting = any(self._open(each).values())
+            if not waiting:
+                each.last_progress = now
+            if each.asked is None and (waiting or not each.taken or self.lost[name]):
                 each.asked = each.client.call_async(Trigger.Request()), now
             patience = _PATIENCE_S if each.client.service_is_ready() else _DISCOVERY_S
             if not each.taken and now - each.met > patience:
@@ -141,7 +144,7 @@ class Listeners:
                 found.setdefault(name, set()).add(topic)
         return found
 
-    def _hear(self, listener: _Listener, now: float) -> None:
+    def _hear(self, name: str, listener: _Listener, now: float) -> None:
         if listener.asked is None:
             return
         future, since = listener.asked
@@ -149,6 +152,7 @@ class Listeners:
             listener.asked = None
             with suppress(DataError):
                 self._enter(listener, _counts(future.result().message), now)
+                self._find_again(name, listener)
         elif now - since > _ASK_AGAIN_S:
             listener.client.remove_pending_request(future)
             listener.asked = None
@@ -159,9 +163,17 @@ class Listeners:
             # One that is new, or began anew, is not sent what was published before.
             if topic not in listener.taken or count < listener.taken[topic]:
                 listener.before[topic] = count - self._published[topic]
-        if taken != listener.taken or not any(self._open(listener).values()):
+        if taken != listener.taken:
             listener.last_progress = now
         listener.taken = taken
+
+    def _find_again(self, name: str, listener: _Listener) -> None:
+        """Take back as lost what came late after all: nobody takes more than was published."""
+        for topic, count in listener.taken.items():
+            surplus = count - listener.before[topic] - self._published[topic]
+            if surplus > 0:
+                listener.before[topic] += surplus
+                self.lost[name] -= min(surplus, self.lost[name])
 
     def _give_up(self, name: str) -> None:
         self._node.destroy_client(self._listeners.pop(name).client)
@@ -174,9 +186,7 @@ class Listeners:
     def _count_lost(self, name: str, listener: _Listener, now: float) -> None:
         waiting = self._open(listener)
         listener.last_progress = now
-        if not (lost := sum(waiting.values())) or listener.asked is not None:
-            return
-        self.lost[name] += lost
+        self.lost[name] += (lost := sum(waiting.values()))
         for topic, count in waiting.items():
             listener.before[topic] -= count
         self._node.get_logger().error(f"{name} has lost {lost} messages on their way")

@@ -198,7 +198,7 @@ class PlayerNode(ManagedNode):
         if self.values["loop"]:
             self._begin()
             return
-        lost = ", ".join(f"{name} lost {n}" for name, n in self._listeners.lost.items())
+        lost = ", ".join(f"{name} lost {n}" for name, n in (+self._listeners.lost).items())
         self.get_logger().info(f"played {self._played()}; {lost or 'all who listen took them'}")
         self.trigger_shutdown()
 
@@ -241,7 +241,7 @@ class PlayerNode(ManagedNode):
         report.values["waited_for"] = " ".join(self._listeners.waited_for)
         if self._obstacle:
             report.add(ERROR, self._obstacle)
-        for name, count in self._listeners.lost.items():
+        for name, count in (+self._listeners.lost).items():
             report.add(WARN, f"{name} lost {count} messages on their way")
         if self._late > _LATE_S:
             report.add(WARN, f"{self._late:.1f} s behind: who listens takes no more a second")
