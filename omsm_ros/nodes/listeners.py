@@ -62,6 +62,7 @@ class Listeners:
         self._bytes: Counter[str] = Counter()
         self._listeners: dict[str, _Listener] = {}
         self._looked = -_LOOK_AROUND_S
+        self._seen: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
         self.deaf: set[str] = set()
         undo.callback(self._forget_all)
@@ -75,8 +76,14 @@ class Listeners:
 
     @property
     def known(self) -> bool:
-        """Whether all who listen were met, or cannot be."""
-        return all(each.taken for each in self._listeners.values())
+        """Whether all who listen were met, or cannot be.
+
+        The middleware may know of one before the graph tells who it is.
+        """
+        unseen = any(
+            p.get_subscription_count() > self._seen[p.topic_name] for p in self._publishers
+        )
+        return not unseen and all(each.taken for each in self._listeners.values())
 
     @property
     def room(self) -> bool:
@@ -98,6 +105,8 @@ class Listeners:
         }
 
     def _has_room(self, listener: _Listener) -> bool:
+        if not listener.taken and listener.client.service_is_ready():
+            return False  # it came just now, and will tell
         waiting = self._open(listener)
         size = sum(n * self._bytes[t] / max(self._published[t], 1) for t, n in waiting.items())
         most = max(waiting.values(), default=0)
@@ -139,6 +148,7 @@ class Listeners:
         for publisher in self._publishers:
             topic = publisher.topic_name
             infos: Sequence[Any] = self._node.get_subscriptions_info_by_topic(topic)
+            self._seen[topic] = len(infos)
             for info in infos:
                 name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
                 found.setdefault(name, set()).add(topic)

@@ -56,11 +56,11 @@ class Node:
     """As far as Listeners needs one; with a listener that takes what it is let take."""
 
     def __init__(self):
-        self.client, self.said = Client(), []
+        self.client, self.said, self.told = Client(), [], True
         self.taken = 0
 
     def get_subscriptions_info_by_topic(self, _):
-        return [Endpoint()]
+        return [Endpoint()] if self.told else []
 
     def create_client(self, *_):
         return self.client
@@ -83,6 +83,9 @@ class Node:
 
 class Publisher:
     topic_name = TOPIC
+
+    def get_subscription_count(self):
+        return 1
 
 
 @pytest.fixture
@@ -112,7 +115,6 @@ def published(listeners, count):
 def test_it_is_waited_for_until_it_has_taken_everything(cell):
     node, listeners, pass_by = cell
     node.taken = 7  # of another player before
-    assert listeners.known  # nobody was met
     listeners.look()
     assert not listeners.known
     pass_by(1.0)
@@ -125,6 +127,29 @@ def test_it_is_waited_for_until_it_has_taken_everything(cell):
     pass_by(1.0)
     assert listeners.waited_for == []
     assert not +listeners.lost
+
+
+def test_one_of_whom_only_the_middleware_knows_is_not_forgotten(cell):
+    """Nothing may begin before it is known who it is, and has told what it took."""
+    node, listeners, pass_by = cell
+    node.told = False
+    pass_by(1.0)
+    assert not listeners.known
+    node.told = True
+    pass_by(1.0)
+    assert listeners.known
+
+
+def test_one_that_comes_while_it_plays_is_asked_first(cell):
+    node, listeners, pass_by = cell
+    node.told = False
+    pass_by(1.0)
+    assert listeners.room
+    node.told = True
+    pass_by(1.0, answering=False)
+    assert not listeners.room
+    pass_by(1.0)
+    assert listeners.room
 
 
 @pytest.mark.parametrize("answering", [True, False])
