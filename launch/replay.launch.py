@@ -5,9 +5,10 @@ ros2 launch omsm_ros replay.launch.py bag:=scan.mcap calibration:=cal.json [rate
 
 from __future__ import annotations
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
 from launch.event_handlers import OnProcessExit
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -26,7 +27,7 @@ def _text(name: str) -> ParameterValue:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Player and corrector in a namespace of their own; the end of the player ends both."""
+    """Player and corrector in a namespace of their own; the end of one ends both."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=described)
         for name, (default, described) in ARGUMENTS.items()
@@ -52,5 +53,18 @@ def generate_launch_description() -> LaunchDescription:
         ],
         output="screen",
     )
-    end = OnProcessExit(target_action=player, on_exit=[Shutdown(reason="all of it was played")])
-    return LaunchDescription([*declared, corrector, player, RegisterEventHandler(end)])
+    ends = [
+        RegisterEventHandler(OnProcessExit(target_action=each, on_exit=ended))
+        for each in (corrector, player)
+    ]
+    return LaunchDescription([*declared, corrector, player, *ends])
+
+
+def ended(event: ProcessExited, context: LaunchContext) -> list[Shutdown]:
+    """End the launch with either of both; exit code 1 if one could not do it."""
+    if event.returncode and not context.is_shutdown:
+        raise RuntimeError(
+            f"not all was played: {event.process_name} ended with exit code {event.returncode}, "
+            "see its line"
+        )
+    return [Shutdown(reason=f"{event.process_name} ended")]
