@@ -90,10 +90,12 @@ class PlayerNode(ManagedNode):
             relative(topic) for topic in held if topic != topics.POINTS_TOPIC
         ]
         found = [topic for topic in held if relative(topic) in names]
-        if unknown := set(names) - {relative(topic) for topic in found} or not found:
+        unknown = sorted(set(names) - {relative(topic) for topic in found})
+        if unknown or not found:
+            there = [t.topic for t in self._bag.topics() if t.messages]
             raise ConfigurationError(
-                f"nothing to play on {unknown!r}; {self.values['bag']!r} has "
-                f"{[relative(topic) for topic in held]!r} of this cell"
+                f"nothing to play on {', '.join(unknown) or 'the topics of this cell'}; "
+                f"{self.values['bag']!r} has {there!r}: see parameters topics and cell"
             )
         return found
 
