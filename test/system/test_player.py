@@ -226,12 +226,17 @@ def test_a_bag_of_a_second_cell_loops_until_it_is_ended(cell, small_scan_blocks)
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("topics", "points"), ("rate", -1.0), ("cell", "/cell9")]
+    ("name", "value", "said"),
+    [
+        ("topics", "points", "nothing to play on points; .*'/omsm/axes', '/omsm/confocal'"),
+        ("rate", -1.0, "rate"),
+        ("cell", "/cell9", "nothing to play on the topics of this cell; .*'/omsm/axes'"),
+    ],
 )
-def test_what_cannot_be_played_is_one_line(cell, small_scan_blocks, name, value):
+def test_what_cannot_be_played_is_one_line(cell, small_scan_blocks, name, value, said):
     path = record(cell.folder / "scan.mcap", small_scan_blocks[:3])
     cell.processes.start("player", bag=str(path), **{name: value})
-    with pytest.raises(Exception, match="exit code 2"):
+    with pytest.raises(Exception, match=f"exit code 2.*{said}"):
         cell.wait("its end", lambda: False)
     cell.processes._running.clear()
 
