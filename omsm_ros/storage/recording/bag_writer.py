@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
@@ -225,8 +227,29 @@ def _not_writable(path: Path, err: Exception) -> BagError:
 def new_writer(file: GrowingFile) -> Writer:
     """Begin an MCAP file of ROS 2, with checksums; samples of a probe do not compress."""
     writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
+    # It keeps an object of a kilobyte for each chunk: of two a second, 200 MB a day.
+    writer._Writer__chunk_indices = _PackedIndex()  # type: ignore[attr-defined]
     writer.start(Profile.ROS2, "omsm_ros")
     return writer
+
+
+class _PackedIndex:
+    """The index of the chunks as the bytes that it will be, in place of a list of its records."""
+
+    def __init__(self) -> None:
+        self._builder, self._packed = RecordBuilder(), bytearray()
+
+    def append(self, index: ChunkIndex) -> None:
+        """Take the record of one more chunk."""
+        index.write(self._builder)
+        self._packed += self._builder.end()
+
+    def __iter__(self) -> Iterator[_PackedIndex]:
+        yield self
+
+    def write(self, stream: RecordBuilder) -> None:
+        """Write all records."""
+        stream.write(bytes(self._packed))
 
 
 def finish(writer: Writer, file: GrowingFile) -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -279,3 +280,18 @@ def test_a_full_tmpfs(tmp_path, small_scan_blocks):
         assert f"holds the first {len(found)} messages, the last 1 are lost" in str(told.value)
     finally:
         subprocess.run(["umount", str(place)], check=True)
+
+
+def test_the_index_of_a_day_fits_into_memory(tmp_path, axes):
+    """Of each chunk no more is kept than is written of it in the end."""
+    with BagWriter(tmp_path / "long.mcap", (bags.AXES_TOPIC,)) as bag:
+        tracemalloc.start()
+        for k in range(2000):
+            bag.write_raw(bags.AXES_TOPIC, k, b"x" * 100)
+            bag.flush()
+        kept = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+    assert kept / 2000 < 200
+    with bags.BagReader(tmp_path / "long.mcap") as reader:
+        assert reader.indexed
+        assert reader.count([bags.AXES_TOPIC]) == 2000
