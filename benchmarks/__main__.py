@@ -36,6 +36,7 @@ PARTS = (
     ),
     "twin",
     "campaign",
+    "viewer",
 )
 
 

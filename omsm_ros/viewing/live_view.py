@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
+from omsm_ros.core.dynamics.calibration import (
+    ACCEPTED,
+    REJECTED,
+    RESERVED,
+    Calibration,
+    verdict_of,
+)
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import AccelerationBlock
 from omsm_ros.core.spectra.density import density
@@ -47,7 +53,7 @@ class LiveView:
         self._map = RunningMap(len(LAYERS))
         self._points = self._left_out = 0
         self._series: deque[tuple[float, float, float, float]] = deque(maxlen=_SERIES_ENTRIES)
-        self._bin: list[NDArray[Any]] = []
+        self._bin: list[tuple[float, float, float]] = []
         self._bin_start = monotonic()
         self._nodes: dict[str, tuple[float, dict[str, Any]]] = {}
         self._calibration: dict[str, Any] = {}
@@ -70,22 +76,18 @@ class LiveView:
             taken = self._map.add(x, y, np.column_stack([height, error, spread]))
             self._points += len(cloud)
             self._left_out += len(cloud) - taken
-            self._bin.append(np.column_stack([error, spread]))
+            self._bin.append(
+                (float(np.nanmin(error)), float(np.nanmax(error)), float(np.nanmedian(spread)))
+            )
             self._close_bin()
 
     def _close_bin(self) -> None:
         now = self._monotonic()
         if now - self._bin_start < _SERIES_STEP_S:
             return
-        values = np.concatenate(self._bin)
-        self._series.append(
-            (
-                now,
-                float(np.nanmin(values[:, 0])),
-                float(np.nanmax(values[:, 0])),
-                float(np.nanmedian(values[:, 1])),
-            )
-        )
+        least, greatest, spreads = np.transpose(self._bin)
+        middle = float(np.median(spreads))
+        self._series.append((now, float(least.min()), float(greatest.max()), middle))
         self._bin, self._bin_start = [], now
 
     def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
@@ -197,21 +199,39 @@ def _grid_entry(grid: Grid) -> dict[str, float]:
 
 
 def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[str, Any]:
-    """Green only if every node is well and the calibration was accepted without reservation."""
+    """The worst of three: the nodes' states, the calibration, and what the corrector measures.
+
+    Green only if every node is well, the calibration was accepted without reservation, and the
+    light of the measurement, which a corrector reports, is green too.
+    """
     reasons = [f"{n['name']}: {n['message']}" for n in nodes if n["level"] != "OK"]
     reasons += [f"{n['name']}: says nothing any more" for n in nodes if n["silent"]]
     worst = max((n["level"] for n in nodes), key=_SEVERITY.index, default="STALE")
     if not nodes:
         reasons.append("no node has said anything yet")
-    if any(n["silent"] for n in nodes):
-        worst = "ERROR"
-    verdict = str(calibration.get("verdict", ""))
-    if not calibration:
-        reasons.append("no calibration yet")
-    elif verdict == "rejected":
-        reasons.append("the calibration was rejected")
-        worst = "ERROR"
-    elif verdict != "accepted":
-        reasons.append(f"the calibration is {verdict or 'not judged'}")
-    colour = "red" if worst == "ERROR" else "amber" if reasons else "green"
+    against = _against(calibration)
+    reasons += [against] * bool(against)
+    measured = [n["values"] for n in nodes if n["values"].get("light") in ("amber", "red")]
+    for values in measured:
+        reasons += [f"measurement: {why}" for why in values.get("light_reasons", "").split("; ")]
+    red = worst == "ERROR" or any(n["silent"] for n in nodes) or _is_rejected(calibration)
+    red = red or any(values["light"] == "red" for values in measured)
+    colour = "red" if red else "amber" if reasons else "green"
     return {"colour": colour, "reasons": reasons[:20]}
+
+
+def _is_rejected(calibration: Mapping[str, Any]) -> bool:
+    """Whether the calibration in force was rejected."""
+    return bool(calibration.get("verdict") == REJECTED)
+
+
+def _against(calibration: Mapping[str, Any]) -> str:
+    """What speaks against the calibration in force; empty if nothing does."""
+    if not calibration:
+        return "no calibration yet"
+    verdict = str(calibration["verdict"])
+    if verdict == REJECTED:
+        return "the calibration was rejected"
+    if not verdict.startswith(ACCEPTED) or verdict.startswith(RESERVED):
+        return f"the calibration is {verdict or 'not judged'}"
+    return ""

@@ -1,3 +1,4 @@
+import dataclasses
 import struct
 
 import numpy as np
@@ -87,7 +88,7 @@ def test_eight_hours_of_points_stay_in_bounded_memory(clock):
     arrays = (view._map._sum, view._map._count, view._map._changed)
     assert sum(array.nbytes for array in arrays) < 10e6
     assert view._map._early is None
-    assert sum(sys.getsizeof(part) for part in view._bin) < 5e6
+    assert sys.getsizeof(view._bin) < 5e6
     assert view.state()["points"] == 4_000_000
 
 
@@ -105,6 +106,39 @@ def test_the_light_is_green_only_if_all_is_well(clock, true_calibration):
     assert view.state()["light"]["colour"] == "red"
 
 
+def test_the_light_of_the_measurement_is_part_of_it(clock, true_calibration):
+    """A cell that runs well does not say that its numbers are good."""
+    view = LiveView(monotonic=clock)
+    view.set_calibration(true_calibration)
+    said = {"light": "amber", "light_reasons": "drift not evaluated; pitch not evaluated"}
+    view.add_state("/omsm/corrector", "OK", "correcting", said)
+    assert view.state()["light"] == {
+        "colour": "amber",
+        "reasons": ["measurement: drift not evaluated", "measurement: pitch not evaluated"],
+    }
+    view.add_state("/omsm/corrector", "OK", "correcting", said | {"light": "red"})
+    assert view.state()["light"]["colour"] == "red"
+    view.add_state("/omsm/corrector", "OK", "correcting", {"light": "green", "light_reasons": ""})
+    assert view.state()["light"] == {"colour": "green", "reasons": []}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "colour"),
+    [
+        ("accepted, supported by data from 0.0055 Hz to 62.6 Hz", "green"),
+        ("accepted with reservations, supported by data from 1 Hz to 60 Hz", "amber"),
+        ("rejected", "red"),
+        ("", "amber"),
+    ],
+)
+def test_the_light_reads_the_verdict_of_a_certificate(clock, true_calibration, verdict, colour):
+    view = LiveView(monotonic=clock)
+    view.add_state("/omsm/corrector", "OK", "correcting", {})
+    certificate = {"verdict": verdict} if verdict else {}
+    view.set_calibration(dataclasses.replace(true_calibration, certificate=certificate))
+    assert view.state()["light"]["colour"] == colour
+
+
 def test_a_node_that_falls_silent_turns_it_red(clock, true_calibration):
     view = LiveView(monotonic=clock)
     view.set_calibration(true_calibration)
@@ -116,8 +150,6 @@ def test_a_node_that_falls_silent_turns_it_red(clock, true_calibration):
 
 
 def test_another_calibration_begins_another_map(clock, true_calibration):
-    import dataclasses
-
     view = LiveView(monotonic=clock)
     view.set_calibration(true_calibration)
     view.add_points(cloud([0.0], [0.0], [1e-9]))

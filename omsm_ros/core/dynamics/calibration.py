@@ -19,7 +19,8 @@ from omsm_ros.errors import CalibrationError, OmsmError
 from omsm_ros.quantities import FREQUENCY, GAIN, SAMPLE_PERIOD
 
 SCHEMA = "omsm-calibration/1"
-REJECTED = "rejected"
+REJECTED, ACCEPTED = "rejected", "accepted"
+RESERVED = "accepted with reservations"
 # A difference of two covariances this little indefinite, of correlations, is rounding.
 _ROUNDING = 1e-9
 

@@ -8,6 +8,7 @@ from itertools import chain
 
 import numpy as np
 
+from omsm_ros.core.dynamics.calibration import ACCEPTED, REJECTED, RESERVED
 from omsm_ros.core.dynamics.latency import ENTRY, unresolved
 from omsm_ros.core.dynamics.masses_and_springs import finite_values, shape
 from omsm_ros.core.dynamics.modes import modal_remainder, mode_entries
@@ -62,8 +63,8 @@ def verdict(
     reservations: what was found in the data and is held by a wider band
     """
     if reasons:
-        return "rejected"
-    kept = "accepted with reservations" if reservations else "accepted"
+        return REJECTED
+    kept = RESERVED if reservations else ACCEPTED
     low, high = quantity(valid_from, "Hz", 2), quantity(valid_up_to, "Hz")
     return f"{kept}, supported by data from {low} to {high}"
 
