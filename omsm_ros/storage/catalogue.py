@@ -54,7 +54,8 @@ class Catalogue:
         waiting = {"timeout": WAIT_S} if sqlite else {"connect_timeout": WAIT_S}
         if not sqlite:
             waiting["options"] = (
-                f"-c statement_timeout={1000 * WAIT_S} -c lock_timeout={1000 * WAIT_S}"  # type: ignore[assignment]
+                f"-c statement_timeout={1000 * WAIT_S} -c lock_timeout={1000 * WAIT_S} "  # type: ignore[assignment]
+                "-c client_encoding=UTF8"  # of a base that has none, all would be bytes
             )
         self._tables = _tables(sqlalchemy)
         with self._translated():
