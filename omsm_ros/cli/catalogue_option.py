@@ -1,12 +1,9 @@
-"""The option that writes down what was calibrated or measured; it never costs a measurement."""
+"""The option that names the catalogue where what was calibrated or measured is written down."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
-
-from omsm_ros.errors import OmsmError
 
 ADDRESS = "OMSM_CATALOGUE"
 """Environment variable: the catalogue of this shop, where none is named."""
@@ -20,17 +17,3 @@ def declare_catalogue(sub: argparse.ArgumentParser) -> None:
         metavar="FILE|URL",
         help=f"write it down there, too; default: ${ADDRESS}",
     )
-
-
-def remembered(address: str, keep: Callable[[], bool]) -> list[str]:
-    """Write something down if there is a catalogue; return a warning where that failed.
-
-    A measurement is never lost because of a database: it lies in its folder already.
-    """
-    if not address:
-        return []
-    try:
-        keep()
-    except (OmsmError, OSError) as err:
-        return [f"not written into the catalogue: {err}; 'omsm history --add' does it later"]
-    return []

@@ -15,7 +15,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
+from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
@@ -31,6 +31,7 @@ from omsm_ros.jobs.identify_table import (
     run_of,
     save_run,
 )
+from omsm_ros.jobs.remember import remembered
 from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.model_file import load_model, save_model

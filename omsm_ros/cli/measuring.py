@@ -18,7 +18,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.catalogue_option import declare_catalogue, remembered
+from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.correction.correct import CorrectionOptions
@@ -30,6 +30,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.measure import Registering, measure
 from omsm_ros.jobs.read_bag import path_in
+from omsm_ros.jobs.remember import remembered
 from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration

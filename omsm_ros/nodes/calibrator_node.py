@@ -26,6 +26,7 @@ from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
+from omsm_ros.jobs.remember import remembered
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
@@ -44,6 +45,7 @@ PARAMETERS = (
     ),
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
     Parameter("settings", "{}", "JSON object of what the calibration belongs to"),
+    Parameter("catalogue", "", "file or URL of the database to write it down in; empty = none"),
     *TRIGGER,
 )
 _STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceBlock}
@@ -61,6 +63,7 @@ class CalibratorNode(ManagedNode):
         self._settings = settings_of(self.values["settings"])
         self._trigger = trigger_of(self.values)
         self._folder = CalibrationFolder(Path(self.values["output"]))
+        self._file = self._folder.link
         capacity = self.values["buffer_samples"]
         self._buffers: dict[str, BlockBuffer[Any]] = {
             topic: BlockBuffer(capacity) for topic in _STREAMS
@@ -123,7 +126,7 @@ class CalibratorNode(ManagedNode):
 
     def _keep_file(self, calibration: Calibration, since_ns: int) -> str:
         try:
-            file = self._folder.put(calibration, since_ns)
+            self._file = file = self._folder.put(calibration, since_ns)
             self._trouble = ""
         except OmsmError as err:
             self._trouble = f"the calibration in force is not kept: {err}"
@@ -142,6 +145,8 @@ class CalibratorNode(ManagedNode):
                 self._messages, calibration, since_ns
             )
             response.success, self._last = self._judge(calibration, since_ns)
+            if response.success and self.values["catalogue"]:
+                self._last += await self._aside.do(partial(self._noted, request.bag, calibration))
             if self.values["report"]:
                 said = await self._aside.do(partial(self._certified, request.bag, identified))
                 self._last += said
@@ -161,6 +166,18 @@ class CalibratorNode(ManagedNode):
         kept = self._keep_file(calibration, since_ns)
         self._topic.tell(calibration, since_ns)
         return True, f"{verdict}; {calibration.id[:12]} {kept}"
+
+    def _noted(self, bag: str, calibration: Calibration) -> str:
+        """Write it into the catalogue and say so; a database that fails undoes no calibration."""
+        # The database's library is an optional package.
+        from omsm_ros.jobs.keep_history import keep_calibration
+
+        source = Path(bag) if bag else None
+        warnings = remembered(
+            self.values["catalogue"],
+            lambda: keep_calibration(self.values["catalogue"], calibration, self._file, source),
+        )
+        return f"; {'; '.join(warnings)}" if warnings else "; written into the catalogue"
 
     def _certified(self, bag: str, identified: Identification) -> str:
         """Write the certificate and say so; a full disk does not undo a calibration."""

@@ -8,6 +8,7 @@ pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
 
 from omsm_msgs.srv import Identify
 
+from omsm_ros.jobs.keep_history import history
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
@@ -24,23 +25,30 @@ def _bag(path, rise):
 
 def test_a_certificate_is_filed_of_every_identification(cell):
     folder, output = cell.folder / "certificates", cell.folder / "cal.json"
-    cell.processes.start("calibrator", output=str(output), report=str(folder))
+    base = str(cell.folder / "base.sqlite")
+    cell.processes.start("calibrator", output=str(output), report=str(folder), catalogue=base)
     page = folder / "certificate.html"
     for rise, success, word in ((0.0, False, "✕ Rejected"), (20e-3, True, "✓ Accepted")):
         bag = _bag(cell.folder / f"rise_{rise}.mcap", rise)
-        reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2)
+        reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=20.0)
         assert reply.success == success, reply.message
         assert str(page) in reply.message
         assert word in page.read_text(encoding="utf-8")
         assert output.exists() == success
+        assert ("written into the catalogue" in reply.message) == success
+    pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
+    (machine,) = history(base)
+    (row,) = machine.calibrations
+    assert (row["path"], row["source"]) == (str(output.resolve()), bag)
 
 
-def test_a_certificate_that_cannot_be_written_does_not_undo_the_calibration(cell):
-    (cell.folder / "taken").write_text("")
-    output = cell.folder / "cal.json"
-    cell.processes.start("calibrator", output=str(output), report=str(cell.folder / "taken"))
+def test_neither_a_certificate_nor_a_database_that_fails_undoes_the_calibration(cell):
+    (cell.folder / "taken").write_text("no database either, " * 100)
+    output, taken = cell.folder / "cal.json", str(cell.folder / "taken")
+    cell.processes.start("calibrator", output=str(output), report=taken, catalogue=taken)
     bag = _bag(cell.folder / "steps.mcap", 20e-3)
-    reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2)
+    reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=20.0)
     assert reply.success
     assert "no certificate" in reply.message
+    assert "not written into the catalogue" in reply.message
     assert output.exists()

@@ -138,7 +138,7 @@ class LivePage {
     const losses = [];
     for (const node of nodes)
       for (const [name, value] of Object.entries(node.values))
-        if (/lost|refused|unmatched|invalid|duplicate|missing|late|overdue|settling|bad_/.test(name) && Number(value) > 0) {
+        if (LOSSES.test(name) && Number(value) > 0) {
           const row = document.createElement("tr");
           row.append(element("th", `${node.name.split("/").pop()}: ${name.replaceAll("_", " ")}`), element("td", value));
           losses.push(row);
@@ -151,6 +151,10 @@ class LivePage {
     document.querySelector("#losses tbody").replaceChildren(...losses);
   }
 }
+
+// Whole words of a count's name: "late", not "latency_max_ms".
+const LOSSES =
+  /(^|_)(lost|refused|unmatched|invalid|duplicates?|missing|late|overdue|settling|bad|slipped|beyond)(_|$)/;
 
 function element(kind, content) {
   const made = document.createElement(kind);
