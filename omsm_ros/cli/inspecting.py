@@ -51,7 +51,7 @@ def _show(facts: Facts) -> None:
     for topic in facts["topics"]:
         period = topic["sample_period"]
         print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
-    table([("wrong", text) for text in facts["faults"]] or [("wrong", "nothing was found")])
+    table([("fault", text) for text in facts["faults"]] or [("faults", "none found")])
 
 
 COMMANDS = (Command("inspect", "show what a bag holds, or repair it", _declare, _act, _show),)

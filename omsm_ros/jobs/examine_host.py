@@ -18,7 +18,15 @@ FINE, DOUBTFUL, FAULTY = "fine", "doubtful", "faulty"
 
 _PYTHONS = ((3, 10), (3, 13))  # the ones that have wheels of ROS 2 Jazzy
 _PACKAGES = ("numpy", "scipy", "control", "rosbags", "pyserial", "PyYAML", "jsonschema")
-_EXTRAS = {"SurfaceTopography": "other instruments' maps", "h5py": "HDF5 files"}
+_EXTRAS = {
+    "SurfaceTopography": "other instruments' maps",
+    "h5py": "HDF5 files",
+    "nptdms": "TDMS files",
+    "websockets": "the live page",
+    "sqlalchemy": "the catalogue",
+    "distributed": "campaigns on several computers",
+    "shtab": "completion in the shell",
+}
 # The demonstration's bag of axes, probe and points has 95 bytes a sample: 0.34 GB an hour at 1 kHz.
 _BYTES_PER_HOUR = 95 * 1000 * 3600
 _ENOUGH_HOURS = 8.0

@@ -33,10 +33,10 @@ class Origin:
 class RowCounter:
     """Counts the rows of a stream by their triggers, else by their time, else one by one."""
 
-    def __init__(self, mapped: ColumnMap, timed: bool, triggered: bool) -> None:
-        """timed, triggered: which of both columns the stream has."""
+    def __init__(self, stream: str, mapped: ColumnMap, timed: bool, triggered: bool) -> None:
+        """timed, triggered: which of both columns the ``stream``, a file or topic, has."""
         if not timed and mapped.sample_period is None:
-            raise FileError("a file has no column of time; state sample_period")
+            raise FileError(f"{stream} has no column of time; state sample_period in the map")
         self._mapped, self._timed, self._triggered = mapped, timed, triggered
         self._period = 0.0 if mapped.sample_period is None else mapped.sample_period
         self._last: tuple[float, int] | None = None

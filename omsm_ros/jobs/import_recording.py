@@ -121,7 +121,7 @@ class _Stream:
         self.sources = sources
         channels = sources[0].channels
         self.triggered = "trigger" in channels
-        self.counter = RowCounter(mapped, "time" in channels, self.triggered)
+        self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
         self.begins, self.period = self.counter.begin(sources[0].first())
 
     def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:

@@ -99,7 +99,9 @@ def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
             raise DataError(f"{channel}: what is one count in SI? write count: 1e-9, say")
         value = float(given[COUNT])
         if not 1e-15 <= abs(value) <= 1.0:
-            raise DataError(f"{channel}: one count is {value:g} in SI, expected 1e-15 to 1")
+            raise DataError(
+                f"{channel}: one count is {value:g} in SI, expected 1e-15 to 1 m or rad"
+            )
         return value * sign
     if unit not in units:
         said = "has no unit" if unit is None else f"has the unit {shown(unit)}"
