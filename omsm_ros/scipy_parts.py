@@ -22,12 +22,16 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-def sosfilt(sections: FloatArray, samples: FloatArray, state: FloatArray) -> FloatArray:
+def sosfilt(
+    sections: FloatArray, samples: FloatArray, state: FloatArray, out: FloatArray | None = None
+) -> FloatArray:
     """Return the response (n,) to ``samples`` (n,); ``state`` (k, 2) is moved on in place.
 
     sections: second-order sections (k, 6) as in scipy, direct form II transposed
+    out: where the response is written, (n,) without gaps; None makes room for it
     """
-    response = np.array(samples, np.float64, order="C")
+    response = np.empty(len(samples)) if out is None else out
+    response[:] = samples
     _filter_loop()(sections, response[np.newaxis], state[np.newaxis])
     return response
 

@@ -32,7 +32,7 @@ from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.pitch_curve import PitchCurve
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import Arrival
 from omsm_ros.core.samples.merging import joined
 from omsm_ros.core.samples.pairing import Intake, Pairing, Run
@@ -238,7 +238,7 @@ class Corrector:
         sample = np.arange(axes.first, axes.end)
         axis_values, probe_values = axes.values, distance.values
         if axes.reasons.any() or distance.reasons.any():
-            good = (axes.reasons | distance.reasons) == Reason.NONE
+            good = _without_gaps((axes.reasons | distance.reasons) == Reason.NONE)
             sample = sample[good]
             axis_values, probe_values = axis_values[:, good], probe_values[:, good]
         x, y, b, c, dynamic_error, moved = axis_values[:RATE]
@@ -262,8 +262,11 @@ class Corrector:
 
     def _of_dynamics(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
         """Variance of H(z) from the noise of the step test, and from what could hide, (n,)."""
-        each = points.dynamics**2
-        return np.sum(each[~points.hidden], axis=0), np.sum(each[points.hidden], axis=0)
+        noise, hidden = np.zeros((2, len(points)))
+        for row, may_hide in zip(points.dynamics, points.hidden, strict=True):
+            total = hidden if may_hide else noise
+            total += row**2
+        return noise, hidden
 
     def _uncertainty(self, reading: FloatArray, points: ScanPoints) -> FloatArray:
         variances = contributions(
@@ -283,6 +286,12 @@ class Corrector:
             common = isinstance(variance, float)
             self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)
         return np.sqrt(sum(variances.values()))
+
+
+def _without_gaps(chosen: BoolArray) -> BoolArray | slice:
+    """``chosen`` (n,) as a slice where it is one: at the start of a scan nothing is copied."""
+    first, last = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
+    return slice(first, last) if np.sum(chosen) == last - first else chosen
 
 
 def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:

@@ -138,9 +138,10 @@ class _Bank:
         for recursion, past in zip(self._dynamics, self._pasts, strict=True):
             recursion.start(past(z.copy()))
 
-    def run(self, z: FloatArray) -> FloatArray:
-        """Return H(z), its rate and its sensitivities, (2 + r, n)."""
-        return np.stack([r.run(z) for r in (self._height, self._rate, *self._dynamics)])
+    def run(self, z: FloatArray, out: FloatArray) -> None:
+        """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
+        for recursion, row in zip((self._height, self._rate, *self._dynamics), out, strict=True):
+            recursion.run(z, row)
 
     @property
     def outputs(self) -> int:
@@ -249,20 +250,27 @@ class MotionFilter:
             recursion.start(past_motion(first[axis].copy()))
 
     def _filtered(self, run: Run) -> Run:
-        outputs = [bank.run(run.values[_Z]) for bank in self._banks]
-        moved = self._blend.mixed(run.values, outputs) if self._blend else outputs[0]
-        out = np.empty((MOVED + len(moved), len(run)))
+        out = np.empty((self._outputs, len(run)))
+        self._moved(run.values, out[MOVED:])
         for row, axis in enumerate(_LATERAL):
             samples = run.values[axis]
             out[row] = self._lateral[axis].run(samples) if self._lateral else samples
-        out[ERROR] = run.values[_Z] - moved[0]
-        out[MOVED:] = moved
+        out[ERROR] = run.values[_Z] - out[MOVED]
         reasons = np.zeros(len(run), np.uint8)
         if self._blend:
             reasons[self._blend.beyond(run.values)] = Reason.BEYOND
         reasons[: self._unsettled] = Reason.SETTLING
         self._unsettled = max(self._unsettled - len(run), 0)
         return Run(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
+
+    def _moved(self, axes: FloatArray, out: FloatArray) -> None:
+        """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
+        if not self._blend:
+            return self._banks[0].run(axes[_Z], out)
+        outputs = [np.empty((bank.outputs, axes.shape[1])) for bank in self._banks]
+        for bank, rows in zip(self._banks, outputs, strict=True):
+            bank.run(axes[_Z], rows)
+        out[:] = self._blend.mixed(axes, outputs)
 
     @property
     def _outputs(self) -> int:

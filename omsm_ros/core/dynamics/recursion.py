@@ -69,9 +69,12 @@ class Recursion:
             state[1] = out.sum() - b0 * motion.sum() - b1 * motion[0] + a1 * out[0]
             motion = out
 
-    def run(self, samples: FloatArray) -> FloatArray:
-        """Response to ``samples`` (n,), shape (n,); bit-identical however the stream is cut."""
-        return sosfilt(self._sections, samples, self._state)
+    def run(self, samples: FloatArray, out: FloatArray | None = None) -> FloatArray:
+        """Response to ``samples`` (n,), shape (n,); bit-identical however the stream is cut.
+
+        out: where it is written, see :func:`omsm_ros.scipy_parts.sosfilt`
+        """
+        return sosfilt(self._sections, samples, self._state, out)
 
 
 def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:

@@ -35,6 +35,8 @@ class EvenSelection:
 
     def chosen(self, rows: int) -> slice:
         """Return which of the next ``rows`` are wanted, for whoever makes only those."""
+        while -(-(self._seen + rows) // self._every) > self._most:
+            self._halve()
         return slice(-self._seen % self._every, rows, self._every)
 
     def add_chosen(self, part: NDArray[Any], rows: int) -> None:
@@ -42,8 +44,6 @@ class EvenSelection:
         self._seen += rows
         if len(part):
             self._parts.append(part)
-        while len(self) > self._most:
-            self._halve()
 
     def _halve(self) -> None:
         """Leave out every other row, part by part, for all at once would need them twice."""
