@@ -34,6 +34,9 @@ _FINALISTS = 3
 _ABOUT_AS_GOOD = 2.0
 # So many orders in a row that predict no better than the best so far end the search.
 _FRUITLESS = 5
+# By so many standard errors a model has to predict better to beat another. A pole too few costs a
+# record with disturbances more than one too many (docs/design/identification-ablation.md).
+_BEATS_BY = 0.5
 # Order of the model by which the delay is chosen.
 _DELAY_ORDER = 3
 # Samples for each parameter: with fewer, an order is not tried.
@@ -291,13 +294,13 @@ def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
 def _plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
     """Return the simplest of those that no other beats: not whitened, then with fewest poles.
 
-    One beats another that is better in the mean by more than one standard error of their
-    difference (Breiman et al. 1984, paired).
+    One beats another that is better in the mean by more than half a standard error of their
+    difference (after Breiman et al. 1984, paired).
     """
     errors = np.array([c.hidden for c in judged])
     with np.errstate(invalid="ignore"):
         worse = errors[:, np.newaxis] - errors[np.newaxis]
-        allowed = np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
+        allowed = _BEATS_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
         unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
     best = int(np.argmin(np.mean(errors, axis=1)))
     every = {best, *np.flatnonzero(unbeaten).tolist()}

@@ -1,6 +1,7 @@
 """The order behind a hold, on simulated systems and measured records."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy import io, signal
 
 from omsm_ros.core.fitting import free_run_choice
 from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
-from omsm_ros.core.fitting.free_run_choice import MAX_ORDER, choose_sampled
+from omsm_ros.core.fitting.free_run_choice import MAX_ORDER, SampledCandidate, choose_sampled
 from omsm_ros.core.fitting.held_problem import DiscreteScaled
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import fit
@@ -111,6 +112,19 @@ def test_an_integrating_plant_does_not_drift_away(seed):
     used = first_half(600)
     found = choose_sampled(u, y, used, 0.1)
     assert np.var((y - output_of(found, y, used))[~used]) < 0.1 * np.var(y[~used])
+
+
+@pytest.mark.parametrize(("gain", "order"), [(0.3, 1), (0.7, 2)])
+def test_a_pole_more_is_taken_for_half_a_standard_error(gain, order):
+    """Errors over seven parts; with a pole more they fall by ``gain`` standard errors."""
+    rng = np.random.default_rng(8)
+    differs = rng.normal(size=7)
+    differs -= np.mean(differs) + gain * np.std(differs, ddof=1) / np.sqrt(7)
+    small, large = (
+        SampledCandidate(None, None, n, False, 10.0 + more) for n, more in ((1, 0.0), (2, differs))
+    )
+    small = replace(small, hidden=np.full(7, 10.0))
+    assert free_run_choice._plainest([small, large]).order == order
 
 
 def test_what_no_model_predicts_is_given_none():
