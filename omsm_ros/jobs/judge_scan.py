@@ -9,10 +9,10 @@ from typing import Any
 
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.light import Light, Reason, light_of
+from omsm_ros.core.correction.light import Light, Reason, light_of, noisier
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, RANDOM, MachineSources
 from omsm_ros.core.correction.scan_fields import resolves_turns, scan_fields
-from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.jobs.correct_bag import Correction
@@ -74,7 +74,7 @@ class Judgement:
             calibration,
             options.sources or ErrorSources.of(calibration),
             {"discretisation": discretisation}
-            | {name: size for name, size in done.budget.items() if size},
+            | {n: size for n, size in done.budget.items() if size or n == SCAN_SCATTER},
             options.geometry,
             self.stated,
             trace.with_slopes(options.surface) if len(trace) else trace,
@@ -111,11 +111,24 @@ def live_light(
 ) -> Light:
     """Return the light of what has been corrected so far, by the uncertainty of its points."""
     shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
-    return light_of(calibration, shared, stated, accuracy=accuracy, pose_open=())
+    return light_of(
+        calibration,
+        shared,
+        stated,
+        accuracy=accuracy,
+        pose_open=(),
+        doubts=tuple(noisier(corrector.budget)),
+    )
 
 
 def _losses(done: Correction) -> Iterator[Reason]:
     yield from map(Reason, done.faults)
+    yield from noisier(done.budget)
+    for text in done.reasons:
+        yield Reason(
+            f"the calibration was used although {text}",
+            "identify as the scan is made, and correct with that calibration",
+        )
     if beyond := done.account["axes"]["counted"].get("beyond"):
         yield Reason(
             f"{beyond} samples lie beyond the range of the calibration set",

@@ -27,7 +27,7 @@ from omsm_ros.core.correction.systematic import (
     SystematicSource,
     standard_fields,
 )
-from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.samples.blocks import FloatArray
@@ -38,6 +38,8 @@ _RANDOM_SAYS = {
     "encoder_noise": "noise of the Z encoder",
     "encoder_resolution": "step of the Z encoder",
     "discretisation": "difference of the digital filter from G",
+    "vibration": "of the probe against the turning part",
+    SCAN_SCATTER: "scatter of this scan beyond what is stated",
 }
 # The noise that a step test tells is that of encoder plus probe at rest: it holds these.
 _HELD = ("probe_resolution", "encoder_noise", "encoder_resolution")
@@ -150,9 +152,12 @@ def _random_rows(
 ) -> Iterator[BudgetRow]:
     at_rest = sources.probe_noise > 0 and not stated.of("probe_noise")
     for name in RANDOM:
-        size, height = getattr(sources, name), random.get(name)
+        size, height = getattr(sources, name, 0.0), random.get(name)
         status, reason = NOT_EVALUATED, ""
-        if size or stated.of(name):
+        if name == SCAN_SCATTER and height is not None:
+            size = height
+            status, reason = EVALUATED, "from sample to sample of this scan"
+        elif size or stated.of(name):
             status, reason = origin_of(name, calibration, stated)
         elif name in _HELD and at_rest:
             status, reason, size, height = EVALUATED, _HELD_BY_NOISE, None, None

@@ -22,10 +22,16 @@ from omsm_ros.core.correction.motion_filter import (
     MotionFilters,
     hidden_rows,
 )
+from omsm_ros.core.correction.scan_scatter import ScanScatter
 from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
-from omsm_ros.core.correction.uncertainty import ErrorSources, contributions
+from omsm_ros.core.correction.uncertainty import (
+    SCAN_SCATTER,
+    ErrorSources,
+    contributions,
+    of_readings,
+)
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
@@ -224,6 +230,8 @@ class Corrector:
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
         self._noise_gain = max(each.height.noise_gain for each in filters)
+        stated = of_readings(self._sources, self._noise_gain, self._static_gain)
+        self._scatter = ScanScatter(float(np.sqrt(sum(stated.values()))))
         self.trace.hidden = hidden_rows(filters)
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)
@@ -255,7 +263,9 @@ class Corrector:
             y=where.y,
             height=where.height,
             dynamic_error=dynamic_error,
-            uncertainty=self._uncertainty(reading, points),
+            uncertainty=self._uncertainty(
+                reading, points, self._scatter.excess(axes.session, sample, where.height)
+            ),
             intensity=intensity.astype(np.float32),
             stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
@@ -268,7 +278,9 @@ class Corrector:
             total += row**2
         return noise, hidden
 
-    def _uncertainty(self, reading: FloatArray, points: ScanPoints) -> FloatArray:
+    def _uncertainty(
+        self, reading: FloatArray, points: ScanPoints, excess: FloatArray
+    ) -> FloatArray:
         variances = contributions(
             self._sources,
             self._noise_gain,
@@ -278,6 +290,7 @@ class Corrector:
             points.z_rate,
             self._options.geometry.abbe_arm,
         )
+        variances[SCAN_SCATTER] = excess
         if self._systematic and self._options.surface is not None:
             points = points.with_slopes(self._options.surface)
         for source in self._systematic:

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from omsm_ros.core.correction.machine_sources import MachineSources
+from omsm_ros.core.correction.machine_sources import RANDOM, MachineSources
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER
 from omsm_ros.core.dynamics.calibration import REJECTED, Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import REMEDY, latency_of
 from omsm_ros.readable import quantity
@@ -20,6 +21,8 @@ GREEN, AMBER, RED = "green", "amber", "red"
 
 # A source this much smaller than what is asked for adds a twentieth to it in squares.
 _SETTLED_SHARE = 1 / 3
+# Light and texture of the part explain less than a fifth more of noise.
+_NOISIER = 1.2
 POSE = ("tilt", "decentre", "clocking")
 # Of each group one statement will do: zero, with a reason, where it is known not to matter.
 _GROUPS: Mapping[str, tuple[tuple[str, ...], str]] = {
@@ -52,6 +55,16 @@ _GROUPS: Mapping[str, tuple[tuple[str, ...], str]] = {
         ("encoder_scale",),
         "compare Z with a laser interferometer, or take it from the scale's certificate, and "
         "state encoder_scale",
+    ),
+    "vibration": (
+        ("vibration",),
+        "hold the probe on the axis of the turning part for some turns, and state vibration, the "
+        "rms of what does not repeat with the turn",
+    ),
+    "change since the step test": (
+        ("lag_change",),
+        "repeat the step test after the scan, run 'omsm compare' on both, and state lag_change, "
+        "by how much their lags differ",
     ),
     "pitch of Z": (
         ("pitch",),
@@ -132,6 +145,23 @@ def light_of(
         return _light(RED, calibration, asked, uncertainty, [too_large, *open_, *doubts])
     open_ += doubts
     return _light(AMBER if open_ else GREEN, calibration, asked, uncertainty, open_)
+
+
+def noisier(budget: Mapping[str, float]) -> Iterator[Reason]:
+    """Yield a reason where readings scatter by more than is stated of them.
+
+    budget: rms of the heights by each source [m]
+    """
+    variances = {name: budget.get(name, 0.0) ** 2 for name in RANDOM}
+    beyond = variances.pop(SCAN_SCATTER)
+    stated = sum(variances.values())
+    if stated > 0 and stated + beyond > _NOISIER**2 * stated:
+        yield Reason(
+            f"heights of this scan scatter by {quantity((stated + beyond) ** 0.5, 'm')}, "
+            f"{quantity(stated**0.5, 'm')} by what is stated of single readings",
+            "compare exposure, intensity and vibration with those of the step test; where the "
+            "scan is as it should be, state probe_noise",
+        )
 
 
 def _light(

@@ -13,7 +13,11 @@ from dataclasses import dataclass, field, fields
 from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
-from omsm_ros.core.correction.uncertainty import ErrorSources, uncertain_parts
+from omsm_ros.core.correction.uncertainty import (
+    SCAN_SCATTER,
+    ErrorSources,
+    uncertain_parts,
+)
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.kinematics import Geometry
@@ -27,9 +31,11 @@ POINT_SOURCES = tuple(field.name for field in fields(ErrorSources))
 # These are uncertain of each point, and of all points together.
 _ALSO_SYSTEMATIC = ("static_gain", "lateral_lag", "motion_error", "pitch")
 _OF_CALIBRATION = ("dynamics", "could_hide")
-RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
+# What somebody can state of single readings, and all that is independent from point to point.
+_STATED_RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
+RANDOM = (*_STATED_RANDOM, SCAN_SCATTER)
 SYSTEMATIC = tuple(KINDS)
-NAMES = (*RANDOM, *SYSTEMATIC)
+NAMES = (*_STATED_RANDOM, *SYSTEMATIC)
 
 
 @dataclass(frozen=True, kw_only=True)

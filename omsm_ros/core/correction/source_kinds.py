@@ -85,6 +85,7 @@ KINDS: dict[str, SourceKind] = {
         "static gain of the probe", _SHARE, of.static_gain, {"gain": quantities.GAIN}
     ),
     "lateral_lag": SourceKind("latency that X and C do not share", _SECONDS, of.lateral_lag),
+    "lag_change": SourceKind("lag of Z since the step test", _SECONDS, of.lateral_lag),
     "motion_error": SourceKind("half the backlash of Z", _METRES, of.backlash),
     "tilt": SourceKind("tilt of the part, each way", _RADIANS, of.tilt),
     "decentre": SourceKind("shift of the part, each way", _METRES, of.decentre, needs_slope=True),

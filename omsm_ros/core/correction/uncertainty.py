@@ -31,6 +31,8 @@ from omsm_ros.quantities import (
 )
 from omsm_ros.units import MICROMETRE_M
 
+# What single readings of a scan scatter by beyond what is stated of them.
+SCAN_SCATTER = "scan_scatter"
 # A direction of the covariance that adds less than this share of the variance is left out.
 _NEGLIGIBLE = 1e-6
 # Sensitivities are derivatives of the motion: each costs one order of the interpolation.
@@ -55,6 +57,7 @@ class ErrorSources:
     lateral_lag: of the sideways lag [s]; it shifts the points along the path
     motion_error: of what follows the motion but not linearly, backlash and the like [m]
     discretisation: of H against G on this motion [m]
+    vibration: of the probe against the part while the spindle turns, rms [m]
     pitch: of the Z slide's pitch [rad], which moves the beam by itself times the Abbe arm
     """
 
@@ -66,6 +69,7 @@ class ErrorSources:
     lateral_lag: float = 0.0
     motion_error: float = 0.0
     discretisation: float = 0.0
+    vibration: float = 0.0
     pitch: float = 0.0
 
     def __post_init__(self) -> None:
@@ -122,18 +126,30 @@ def contributions(
     abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
+    scatter: dict[str, FloatArray | float] = {**of_readings(sources, noise_gain, static_gain)}
     return {
         "dynamics": dynamics,
         "could_hide": hidden,
         "lateral_lag": (sources.lateral_lag * z_rate) ** 2,
         "static_gain": (scale * distance) ** 2,
+        **scatter,
+        "motion_error": sources.motion_error**2,
+        "discretisation": sources.discretisation**2,
+        "pitch": (abbe_arm * sources.pitch) ** 2,
+    }
+
+
+def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) -> dict[str, float]:
+    """Variances of a height [m²] by what scatters from reading to reading.
+
+    noise_gain: of H for white noise
+    """
+    return {
         "probe_noise": (sources.probe_noise / static_gain) ** 2,
         "probe_resolution": (sources.probe_resolution / static_gain) ** 2 / 12,
         "encoder_noise": (noise_gain * sources.encoder_noise) ** 2,
         "encoder_resolution": (noise_gain * sources.encoder_resolution) ** 2 / 12,
-        "motion_error": sources.motion_error**2,
-        "discretisation": sources.discretisation**2,
-        "pitch": (abbe_arm * sources.pitch) ** 2,
+        "vibration": sources.vibration**2,
     }
 
 

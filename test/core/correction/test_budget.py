@@ -19,7 +19,7 @@ from omsm_ros.core.correction.machine_sources import (
 from omsm_ros.core.correction.scan_trace import MOST_TRACED, ScanTrace
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, NOT_EVALUATED
-from omsm_ros.core.correction.uncertainty import ErrorSources
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import declared, with_latency
 from omsm_ros.core.machine.kinematics import Geometry, WorkpiecePoints
@@ -50,10 +50,10 @@ def test_every_source_has_a_row_and_unknown_ones_are_said_to_be(
     true_calibration: Calibration,
 ) -> None:
     found = budget(true_calibration)
-    assert sorted(row.source for row in found.rows) == sorted(NAMES)
+    assert sorted(row.source for row in found.rows) == sorted([*NAMES, SCAN_SCATTER])
     assert {row.status for row in found.rows} == {NOT_EVALUATED}
     assert all(row.height is None and row.standard_uncertainty is None for row in found.rows)
-    assert set(found.not_evaluated) == set(NAMES)
+    assert set(found.not_evaluated) == {*NAMES, SCAN_SCATTER}
 
 
 def test_a_source_that_is_declared_zero_is_declared_and_not_unknown(
@@ -215,10 +215,13 @@ def test_a_declared_tilt_is_in_the_uncertainty_of_each_point(
     true_calibration: Calibration, small_scan: Recording
 ) -> None:
     said = MachineSources((stated("tilt", 1e-5), stated("decentre", 1e-6)))
-    options = CorrectionOptions(sources=ErrorSources(), systematic=said.of_the_scan())
+    noise = ErrorSources(probe_noise=1.2e-8)
+    options = CorrectionOptions(sources=noise, systematic=said.of_the_scan())
+    _, without = corrected(true_calibration, small_scan, CorrectionOptions(sources=noise))
     corrector, tilted = corrected(true_calibration, small_scan, options)
     radius = 1e-5 * np.hypot(*(getattr(corrector.trace.points(), name) for name in "xy"))
-    assert np.sqrt(np.mean(tilted**2)) == pytest.approx(np.sqrt(np.mean(radius**2)), rel=1e-3)
+    added = np.sqrt(np.mean(tilted**2 - without**2))
+    assert added == pytest.approx(np.sqrt(np.mean(radius**2)), rel=1e-3)
     # What shifts a point needs the slope there.
     assert "decentre" not in corrector.budget
     known = replace(options, surface=PAPER_MIRROR)

@@ -23,6 +23,8 @@ LOOKED_AT = {
     "probe_slope": {},
     "encoder_scale": {},
     "pitch": {},
+    "vibration": {},
+    "lag_change": {},
 }
 
 
