@@ -110,6 +110,11 @@ def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibrat
         )
     )
 
+    time = axes.sample_period * np.arange(len(axes))
+    # Smooth, so that nothing scatters by more than is stated.
+    axes = replace(axes, z=1e-4 * np.sin(2 * np.pi * time))
+    distance = replace(distance, distance=1e-5 * np.cos(2 * np.pi * time))
+
     def corrected(**sources):
         # A pitch moves a beam one metre off the encoder's line by a metre a radian.
         options = CorrectionOptions(

@@ -124,6 +124,10 @@ def _correct(args: argparse.Namespace) -> Facts:
     nominal = load_surface(args.nominal) if args.nominal else None
     if args.fit and nominal is None:
         raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
+    if args.lateral and nominal is None:
+        raise ConfigurationError(
+            "--lateral costs height by the slope of the surface; give --nominal SURFACE.yaml"
+        )
     if args.tolerance and not args.fit:
         raise ConfigurationError("--tolerance needs a deviation to judge; give --fit auto")
     options = CorrectionOptions(

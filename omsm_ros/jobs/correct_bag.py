@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
+from omsm_ros.jobs.sideways_errors import Sideways, add_sideways
 from omsm_ros.storage.cloud_file import PlyWriter
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -101,7 +102,9 @@ def correct_bag(
                     if nominal is not None and lateral:
                         points = with_lateral(points, nominal, lateral)
                     found.add(points, ply.write(points))
-        return _correction(scan, found)
+        sideways = add_sideways(cloud, scan.options, scan.trace, MOST_DRAWN)
+        done = _correction(scan, found)
+        return done if sideways is None else _with_sideways(done, sideways)
 
 
 class _Findings:
@@ -149,6 +152,17 @@ class _Findings:
         if not len(self.drawn):
             return {}
         return {name: running.statistics() for name, running in self._running.items()}
+
+
+def _with_sideways(done: Correction, sideways: Sideways) -> Correction:
+    if not sideways.heights:
+        return replace(done, faults=(*done.faults, *sideways.warnings))
+    return replace(
+        done,
+        budget=done.budget | sideways.heights,
+        largest_uncertainty=sideways.largest,
+        points=sideways.points,
+    )
 
 
 def _correction(scan: CorrectedScan, found: _Findings) -> Correction:

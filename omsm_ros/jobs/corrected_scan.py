@@ -147,6 +147,11 @@ class CorrectedScan:
         return self._corrector.slips.found
 
     @property
+    def options(self) -> CorrectionOptions:
+        """How it is corrected."""
+        return self._options
+
+    @property
     def trigger(self) -> CommonTrigger:
         """What is stated of the two counters."""
         return self._options.trigger

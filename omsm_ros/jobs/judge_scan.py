@@ -117,8 +117,18 @@ def live_light(
         stated,
         accuracy=accuracy,
         pose_open=(),
-        doubts=tuple(noisier(corrector.budget)),
+        doubts=(*noisier(corrector.budget), *_without_slopes(corrector, stated)),
     )
+
+
+def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[Reason]:
+    sideways = {s.name for s in stated.of_the_scan() if s.needs_slope and s.standard_uncertainty}
+    missing = sorted(sideways - set(corrector.budget))
+    if missing and corrector.trace.seen:
+        yield Reason(
+            f"{', '.join(missing)} not in the uncertainty of the points: no slopes are known",
+            "give the corrector the part's surface (parameter nominal)",
+        )
 
 
 def _losses(done: Correction) -> Iterator[Reason]:

@@ -81,6 +81,9 @@ PARAMETERS = (
         quantities.BUDGET,
         unset=_NOT_ASKED,
     ),
+    Parameter(
+        "nominal", "", "SURFACE.yaml, for what errors sideways cost; '' = slopes are not known"
+    ),
     Parameter("sources_file", "", "SOURCES.yaml: what is uncertain of the machine; '' = nothing"),
     *(
         Parameter(

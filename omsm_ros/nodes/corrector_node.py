@@ -33,6 +33,7 @@ from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_file import load_calibration, load_for_others
 from omsm_ros.storage.calibration_folder import confined, since
+from omsm_ros.storage.surface_file import load_surface
 
 _STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 _COMPLAINT_PERIOD_S = 5.0
@@ -50,6 +51,8 @@ class CorrectorNode(ManagedNode):
         """Take up the calibration to start with, and answer requests."""
         self._settings = settings_of(self.values["settings"])
         self._options, self._sources = options_of(self.values), sources_of(self.values)
+        nominal = self.values["nominal"]
+        self._nominal = load_surface(nominal) if nominal else None
         self._frame = self.values["workpiece_frame"]
         self._corrector: Corrector | None = None
         self._probe: dict[str, object] = {}
@@ -98,7 +101,7 @@ class CorrectorNode(ManagedNode):
         override = self.values["override"]
         admit(calibration, reasons, override)
         corrector = Corrector(
-            calibration, with_sources(self._options, calibration, self._sources, None)
+            calibration, with_sources(self._options, calibration, self._sources, self._nominal)
         )
         # Nothing is refused from here on: the calibration in force is one, wholly.
         self._publish_rest()

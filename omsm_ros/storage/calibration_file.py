@@ -80,7 +80,14 @@ def _text_of(path: Path | str) -> str:
 
 def _calibration_in(text: str, path: Path | str) -> Calibration:
     what = f"calibration {str(path)!r}"
-    content = strict_json.object_of(text, CalibrationError, what)
+    return calibration_of(strict_json.object_of(text, CalibrationError, what), what)
+
+
+def calibration_of(content: dict[str, Any], what: str) -> Calibration:
+    """Return the calibration, or the set, of a file's ``content``, which messages call ``what``.
+
+    Raises CalibrationError if it is malformed, altered or implausible.
+    """
     is_set = content.get("schema") == SET_SCHEMA
     check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints, pack_points
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import POSITION
 from omsm_ros.storage.files import open_regular, whole_file
@@ -115,3 +116,22 @@ class CloudFile:
         every = 1 if most is None else max(-(-self.points // most), 1)
         parts = [part[::every].copy() for part in self.portions(every * 100_000)]
         return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])
+
+
+def widened(
+    path: Path, variance: Callable[[int, int], FloatArray], size: int = 500_000
+) -> Iterator[NDArray[np.void]]:
+    """Add a variance to the uncertainty of each point of our cloud; yield the points as they are.
+
+    variance: [m²] of so many points from the one with that number on, (n,)
+    """
+    first = 0
+    with path.open("r+b") as stream:
+        for before in CloudFile(path).portions(size):
+            rows = before.copy()
+            spread = before["uncertainty"].astype(np.float64)
+            rows["uncertainty"] = np.sqrt(spread**2 + variance(first, len(rows)))
+            stream.seek(_PLY_HEADER_BYTES + first * _PLY_DTYPE.itemsize)
+            stream.write(rows.tobytes())
+            first += len(rows)
+            yield rows

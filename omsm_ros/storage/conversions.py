@@ -16,14 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import CalibrationError
 from omsm_ros.storage import strict_json
+from omsm_ros.storage.calibration_file import calibration_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
-MAX_JSON_CHARACTERS = 1_000_000
+# A set of the most members, each with a certificate of its own, is a megabyte.
+MAX_JSON_CHARACTERS = 2_000_000
+_SET = "calibration_set"
 
 _AXES = ("x", "y", "z", "b", "c")
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
@@ -102,7 +106,13 @@ def acceleration_block(message: Any) -> AccelerationBlock:
 
 
 def calibration(message: Any) -> Calibration:
-    """Record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered."""
+    """Record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
+
+    The certificate of a set carries the whole set; the other fields are then its middle member's.
+    """
+    certificate = _json_object("certificate", message.certificate)
+    if isinstance(content := certificate.get(_SET), dict):
+        return calibration_of({**content, "id": message.id}, "calibration message")
     record = Calibration.from_content(
         {
             "numerator": message.numerator,
@@ -113,7 +123,7 @@ def calibration(message: Any) -> Calibration:
             "valid_up_to": message.valid_up_to,
             "covariance": message.covariance,
             "settings": _json_object("settings", message.settings),
-            "certificate": _json_object("certificate", message.certificate),
+            "certificate": certificate,
         }
     )
     if message.id != record.id:
@@ -189,7 +199,10 @@ def acceleration_message(messages: Messages, block: AccelerationBlock, frame: st
 
 
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
-    """``omsm_msgs/Calibration`` of a record."""
+    """``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
+    certificate = dict(record.certificate)
+    if isinstance(record, CalibrationSet):
+        certificate[_SET] = record.content()
     return messages.make(
         "Calibration",
         header=header(messages, stamp_ns, "machine"),
@@ -202,7 +215,7 @@ def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) 
         valid_up_to=record.valid_up_to,
         covariance=messages.sequence(record.covariance.ravel(), np.float64),
         settings=json.dumps(dict(record.settings), sort_keys=True),
-        certificate=json.dumps(dict(record.certificate), sort_keys=True),
+        certificate=json.dumps(certificate, sort_keys=True),
     )
 
 

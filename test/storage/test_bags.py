@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from omsm_ros.core.correction.calibration_set import CalibrationSet, calibration_set
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bags, conversions, message_types
@@ -105,6 +106,22 @@ def test_a_block_that_contradicts_itself_is_refused(tmp_path, small_scan_blocks)
         writer.write(bags.AXES_TOPIC, 0, message)
     with pytest.raises(BagError, match="different lengths"):
         _open(path, bags.AXES_TOPIC)
+
+
+def test_a_set_of_calibrations_survives_the_message(true_calibration):
+    made = calibration_set("x", [(0.0, true_calibration), (0.01, true_calibration)])
+    message = conversions.calibration_message(message_types.bag_messages(), made, 7)
+    heard = conversions.calibration(message)
+    assert isinstance(heard, CalibrationSet)
+    assert (heard.id, heard.positions) == (made.id, (0.0, 0.01))
+    # Whoever knows no sets sees the member nearest to the middle.
+    assert np.array_equal(message.numerator, made.dynamics.numerator)
+    message.certificate = message.certificate.replace('"along": "x"', '"along": "z"')
+    with pytest.raises(conversions.CalibrationError, match="altered"):
+        conversions.calibration(message)
+    message.certificate = '{"calibration_set": {"schema": "omsm-calibration-set/1"}}'
+    with pytest.raises(conversions.CalibrationError, match="calibration message"):
+        conversions.calibration(message)
 
 
 def test_calibration_survives_the_message(true_calibration):

@@ -22,7 +22,6 @@ from omsm_ros.core.correction.motion_filter import (
     MotionFilters,
     hidden_rows,
 )
-from omsm_ros.core.correction.scan_scatter import ScanScatter
 from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
@@ -42,6 +41,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBl
 from omsm_ros.core.samples.continuity import Arrival
 from omsm_ros.core.samples.merging import joined
 from omsm_ros.core.samples.pairing import Intake, Pairing, Run
+from omsm_ros.core.samples.scatter import RunningScatter
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
@@ -231,7 +231,7 @@ class Corrector:
         filters = [MotionFilters.of(member, period, lag) for member in members]
         self._noise_gain = max(each.height.noise_gain for each in filters)
         stated = of_readings(self._sources, self._noise_gain, self._static_gain)
-        self._scatter = ScanScatter(float(np.sqrt(sum(stated.values()))))
+        self._scatter = RunningScatter(float(np.sqrt(sum(stated.values()))))
         self.trace.hidden = hidden_rows(filters)
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import signal
 
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
 # Of the normal distribution, whose median absolute value is 0.6745 σ.
 SIGMA_OF_MAD = 1.4826
+_ORDER = 6
+# Of white noise of unit size: Σ binomial(6, k)².
+_GAIN = np.sqrt(924.0)
+# Of normal values, whose mean size is √(2/π) σ; one speck of dust counts less than in a square.
+_SIGMA_OF_MEAN_SIZE = np.sqrt(np.pi / 2)
+# Differences over which it is averaged, exponentially: known to 2 % then.
+_MEMORY = 2048
+# Five standard deviations of that: what exceeds less is chance.
+_EXCEEDS = 1.1
+# No reading scatters by less; heights of metres are rounded to it.
+_ROUNDING_M = 1e-12
 
 
 def spread(values: FloatArray) -> float:
@@ -24,3 +36,60 @@ def noise_of(deviation: FloatArray) -> float:
     if len(deviation) < 3:
         return 0.0
     return spread(np.diff(deviation, 2)) / float(np.sqrt(6))
+
+
+class RunningScatter:
+    """Follows the scatter of a scan's heights, sample by sample, however they are cut into blocks.
+
+    A probe that looks at a turning part may be noisier than at rest before a flat: it sees less
+    light, something vibrates, or readings step where noise at rest did not carry them over the
+    step. That shows in the heights themselves, whatever the surface is: sixth differences of 0.3 mm
+    at 40 Hz, sampled at 1 kHz, are 37 nm, those of white noise are √924 of it.
+
+    expected: standard deviation of one height by what is stated of single readings [m]; zero where
+        nothing is stated, and then every scatter exceeds it
+    """
+
+    def __init__(self, expected: float) -> None:
+        self._expected = expected
+        self._decay = np.exp(-1 / _MEMORY)
+        self._session: int | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        prior = float(_MEMORY) if self._expected > 0 else 0.0
+        self._sums = [self._expected * prior, prior]
+        self._samples = np.empty(0, np.int64)
+        self._heights = np.empty(0)
+
+    def excess(self, session: int, sample: IntArray, height: FloatArray) -> FloatArray:
+        """Return the variance of each next height beyond what was expected [m²], (n,).
+
+        session, sample: counts of its trigger, by which neighbours are known
+        """
+        if session != self._session:
+            self._session = session
+            self._begin()
+        before = len(self._samples)
+        samples = np.concatenate([self._samples, sample])
+        heights = np.concatenate([self._heights, height])
+        self._samples, self._heights = samples[-_ORDER:], heights[-_ORDER:]
+        neighbours = samples[_ORDER:] - samples[:-_ORDER] == _ORDER
+        sizes = np.abs(np.diff(heights, _ORDER))[neighbours] * (_SIGMA_OF_MEAN_SIZE / _GAIN)
+        running = self._running(sizes)
+        # Of each height, by the differences up to it: those of earlier blocks stand in front.
+        seen = np.zeros(len(samples), np.int64)
+        seen[_ORDER:] = np.cumsum(neighbours)
+        scatter = running[seen[before:]]
+        exceeds = scatter > max(_EXCEEDS * self._expected, _ROUNDING_M)
+        return np.where(exceeds, scatter**2 - self._expected**2, 0.0)
+
+    def _running(self, sizes: FloatArray) -> FloatArray:
+        """Return the mean before any of ``sizes`` (n,) and after each of them, (n + 1,)."""
+        sums = []
+        for k, values in enumerate((sizes, np.ones(len(sizes)))):
+            state = np.array([self._decay * self._sums[k]])
+            after, _ = signal.lfilter([1.0], [1.0, -self._decay], values, zi=state)
+            sums.append(np.concatenate([[self._sums[k]], after]))
+            self._sums[k] = float(sums[k][-1])
+        return np.asarray(sums[0] / np.maximum(sums[1], np.finfo(np.float64).tiny), np.float64)

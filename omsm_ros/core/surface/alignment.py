@@ -9,7 +9,7 @@ with the corrected geometry.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +22,10 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.samples.scatter import noise_of
 from omsm_ros.errors import DataError
 from omsm_ros.least_squares import least_squares, unit_columns
-from omsm_ros.readable import quantity
+from omsm_ros.readable import measured, quantity
 from omsm_ros.units import MICROMETRE_M
 
+_OfUnknown = Callable[[FloatArray], FloatArray]
 _COLUMNS = ("x", "y", "z", "b", "c", "distance")
 # Ten groups of consecutive points, whose scatter is then known to a quarter.
 _MIN_POINTS = 1000
@@ -34,6 +35,10 @@ _MAX_POINTS = 60_000
 _GROUP_POINTS = 100
 # Unknowns are fitted in these units: micrometres for lengths, milliradians for slopes.
 _SLOPE_UNIT = 1e-3
+# A certified radius is known to better; one that is off by more is another's, or a slip of the pen.
+_RADIUS_KNOWN = 2e-4
+# No five standard deviations are chance.
+_CERTAIN = 5.0
 # With less than this a slope of the beam moves no point by a nanometre.
 _USEFUL_DISTANCE_M = 2e-6
 
@@ -132,27 +137,31 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     radius: of the sphere [m], certified; negative for a convex one
     geometry: what is known already: the probe's place; its centre and beam are the start
 
-    Raises DataError for a scan that is too short, or does not look like the sphere.
+    Raises DataError for a scan that is too short, does not look like a sphere, or looks like one of
+    another radius.
     """
     scan = _thinned(scan)
     start = geometry or Geometry()
     beam = bool(np.ptp(scan.distance) > _USEFUL_DISTANCE_M)
     first = _first_guess(scan, radius, start, beam)
-    found = optimize.least_squares(
-        lambda unknown: _misfit(scan, radius, start, unknown),
-        first,
-        jac=lambda unknown: _jacobian(scan, start, unknown),
-        method="lm",
-        x_scale="jac",
+    free = _fitted(
+        radius,
+        lambda u: _misfit(scan, u[-1] * MICROMETRE_M, start, u[:-1]),
+        lambda u: np.c_[_jacobian(scan, start, u[:-1]), np.full(len(scan.z), -np.sign(radius))],
+        np.append(first, radius / MICROMETRE_M),
     )
-    residual = float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
-    if not found.success or residual > 0.01 * abs(radius):
-        raise DataError(
-            f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: "
-            f"{quantity(residual, 'm')} rms are left; "
-            "check the radius and its sign, and that the scan covers the sphere"
-        )
+    known = _checked_radius(free, radius)
+    found = _fitted(
+        radius,
+        lambda u: _misfit(scan, radius, start, u),
+        lambda u: _jacobian(scan, start, u),
+        first,
+    )
+    residual = _rms(found)
     deviations = _standard_uncertainties(found.jac, found.fun)
+    if not known:
+        # By what a radius that is hardly right moves them.
+        deviations = np.hypot(deviations, found.x - free.x[:-1])
     aligned = _with(start, found.x)
     in_si = np.append(deviations[:2] * MICROMETRE_M, (deviations[5:] * _SLOPE_UNIT))
     lean = in_si[2:] if beam else (np.inf, np.inf)
@@ -166,6 +175,40 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
         beam_found=beam,
         used=len(scan.z),
     )
+
+
+def _fitted(
+    radius: float, misfit: _OfUnknown, jacobian: _OfUnknown, first: FloatArray
+) -> optimize.OptimizeResult:
+    found = optimize.least_squares(misfit, first, jac=jacobian, method="lm", x_scale="jac")
+    if not found.success or _rms(found) > 0.01 * abs(radius):
+        raise DataError(
+            f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: "
+            f"{quantity(_rms(found), 'm')} rms are left; "
+            "check the radius and its sign, and that the scan covers the sphere"
+        )
+    return found
+
+
+def _rms(found: optimize.OptimizeResult) -> float:
+    """Of the distances of the points from the sphere [m]."""
+    return float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
+
+
+def _checked_radius(free: optimize.OptimizeResult, radius: float) -> bool:
+    """Return whether the radius that fits best, last of what is found, is the one that is given.
+
+    Raises DataError where it is so far off that the centre found would be no centre.
+    """
+    fits = float(free.x[-1]) * MICROMETRE_M
+    spread = float(_standard_uncertainties(free.jac, free.fun)[-1]) * MICROMETRE_M
+    off = abs(fits - radius)
+    if off > max(_CERTAIN * spread, _RADIUS_KNOWN * abs(radius)):
+        raise DataError(
+            f"the scan is of a sphere of radius {measured(fits, spread, 'm')} (k = 1), not "
+            f"{quantity(radius, 'm', 6)}; check the radius, or the scale of Z"
+        )
+    return off <= 2 * spread
 
 
 def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:

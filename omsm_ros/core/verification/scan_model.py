@@ -88,9 +88,10 @@ class ScanModel:
 
     @property
     def speeds(self) -> list[float]:
-        """Median spindle speed of each scan [rad/s], with its sign."""
+        """Median spindle speed of each scan [rad/s], with the sign of its C."""
         rate = self._column["angular_rate"]
-        return [float(np.median(rate[self.scan == k])) for k in range(self.number)]
+        # The probe goes round the part against the turn of C.
+        return [-float(np.median(rate[self.scan == k])) for k in range(self.number)]
 
     def own(self, scan: int) -> slice:
         """Where clocking, shift and tilt of ``scan`` (1, 2, …) stand among the parameters."""

@@ -110,8 +110,7 @@ def test_members_that_are_alike_are_as_one(scan: Recording, true_calibration: Ca
     same = calibration_set("x", [(0.0, true_calibration), (RIM, true_calibration)])
     one, both = corrected(true_calibration, scan)[0], corrected(same, scan)[0]
     assert np.allclose(one.height, both.height, atol=1e-15, rtol=0)
-    # Rounding of the heights scatters.
-    assert np.all(both.uncertainty < 1e-15)
+    assert np.all(both.uncertainty == 0)
 
 
 def test_beyond_the_range_there_are_no_points_and_each_is_counted(

@@ -9,11 +9,11 @@ import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.light import noisier
-from omsm_ros.core.correction.scan_scatter import ScanScatter
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.samples.scatter import RunningScatter
 
 NOISE = 10e-9
 COUNT = 20_000
@@ -28,19 +28,19 @@ def noise(size: float, seed: int = 1) -> FloatArray:
 
 def test_noise_as_stated_and_a_moving_surface_exceed_nothing() -> None:
     for seed in range(3):
-        excess = ScanScatter(NOISE).excess(0, SAMPLE, SURFACE + noise(NOISE, seed))
+        excess = RunningScatter(NOISE).excess(0, SAMPLE, SURFACE + noise(NOISE, seed))
         assert not excess.any()
 
 
 def test_more_noise_than_stated_is_found() -> None:
-    excess = ScanScatter(NOISE).excess(0, SAMPLE, SURFACE + noise(4 * NOISE))
+    excess = RunningScatter(NOISE).excess(0, SAMPLE, SURFACE + noise(4 * NOISE))
     assert np.sqrt(excess[6000:] + NOISE**2) == pytest.approx(4 * NOISE, rel=0.08)
     rms = np.sqrt(np.mean(excess[6000:]) + NOISE**2)
     assert rms == pytest.approx(4 * NOISE, rel=0.02)
 
 
 def test_where_nothing_is_stated_all_of_it_counts() -> None:
-    excess = ScanScatter(0.0).excess(0, SAMPLE, noise(NOISE))
+    excess = RunningScatter(0.0).excess(0, SAMPLE, noise(NOISE))
     assert np.sqrt(np.mean(excess[100:])) == pytest.approx(NOISE, rel=0.03)
     assert not excess[:6].any()
 
@@ -49,9 +49,9 @@ def test_blocks_of_any_length_give_the_same_to_the_last_bit() -> None:
     height, random = SURFACE + noise(3 * NOISE), np.random.default_rng(5)
     kept = random.random(COUNT) > 0.05
     sample, height = SAMPLE[kept], height[kept]
-    whole = ScanScatter(NOISE).excess(0, sample, height)
+    whole = RunningScatter(NOISE).excess(0, sample, height)
     cuts = [0, 1, 2, 5, *np.sort(random.integers(6, len(sample), 40)), len(sample)]
-    parts = ScanScatter(NOISE)
+    parts = RunningScatter(NOISE)
     found = [parts.excess(0, sample[a:b], height[a:b]) for a, b in pairwise(cuts)]
     assert np.array_equal(np.concatenate(found), whole)
 
@@ -60,8 +60,8 @@ def test_a_step_across_lost_samples_or_a_restart_is_no_scatter() -> None:
     height = noise(NOISE)
     height[COUNT // 2 :] += 1e-3
     later = np.where(height > 5e-4, SAMPLE + 100, SAMPLE)
-    assert not ScanScatter(NOISE).excess(0, later, height).any()
-    scatter, half = ScanScatter(NOISE), COUNT // 2
+    assert not RunningScatter(NOISE).excess(0, later, height).any()
+    scatter, half = RunningScatter(NOISE), COUNT // 2
     parts = [
         scatter.excess(session, SAMPLE[:half], height[session * half :][:half])
         for session in (0, 1)
@@ -72,7 +72,7 @@ def test_a_step_across_lost_samples_or_a_restart_is_no_scatter() -> None:
 def test_a_speck_of_dust_widens_what_is_near_it_alone() -> None:
     height = noise(NOISE)
     height[5000] += 3e-6
-    excess = ScanScatter(NOISE).excess(0, SAMPLE, height)
+    excess = RunningScatter(NOISE).excess(0, SAMPLE, height)
     assert not excess[:5000].any()
     assert 0 < np.sqrt(excess[5006]) < 4 * NOISE
     assert not excess[15_000:].any()

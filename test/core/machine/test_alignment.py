@@ -116,9 +116,17 @@ def test_a_scan_too_short_is_refused() -> None:
         align_on_sphere(few, RADIUS)
 
 
-def test_another_sphere_leaves_more_than_noise() -> None:
-    found = align_on_sphere(sphere_scan(), 1.02 * RADIUS)
-    assert found.residual > 100e-9
+@pytest.mark.parametrize("factor", [0.98, 1.002, 1.02])
+def test_another_sphere_is_refused_and_its_radius_named(factor: float) -> None:
+    with pytest.raises(DataError, match=r"sphere of radius 20\.0000\d+ mm .*check the radius"):
+        align_on_sphere(sphere_scan(), factor * RADIUS)
+
+
+def test_a_radius_that_is_hardly_right_is_in_the_uncertainty() -> None:
+    exact, off = (align_on_sphere(sphere_scan(), f * RADIUS) for f in (1.0, 1.0001))
+    error = abs(off.geometry.centre_x - TRUE.centre_x)
+    assert error > 5 * exact.uncertainty[0]
+    assert error < 2 * off.uncertainty[0]
 
 
 def test_a_scan_is_read_back_from_corrected_points() -> None:

@@ -96,7 +96,9 @@ def test_two_speeds_and_a_step_test_divide_the_lag(share: float) -> None:
     latency = share * LAG_S
     known = step_test(latency, off=0.7e-6)
     pair = [scanned(made(rpm, s, disturbed(latency)), known) for s, rpm in ((1, 30.0), (2, 60.0))]
-    result = resolved(known, self_calibrate(pair, after_step_test(known)))
+    calibrated = self_calibrate(pair, after_step_test(known))
+    assert np.allclose(calibrated.speeds, [np.pi, 2 * np.pi], rtol=1e-3)
+    result = resolved(known, calibrated)
     found = latency_of(result)
     assert found.source == SPEEDS
     assert found.uncertainty_s is not None
