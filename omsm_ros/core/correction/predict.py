@@ -91,7 +91,9 @@ def predict_error(
     error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
     spread = float(np.ptp(error))
     dynamics, hidden = _dynamics_limit(calibration, path, budget)
-    others, missing = speed_limits(path, limits or MachineLimits(), calibration.valid_up_to, budget)
+    others, missing = speed_limits(
+        path, limits or MachineLimits(), calibration.valid_up_to, budget, calibration.dynamics
+    )
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
     return Prediction(

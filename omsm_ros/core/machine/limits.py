@@ -184,15 +184,20 @@ def highest_factor(
 
 
 def speed_limits(
-    path: ScanPath, limits: MachineLimits, valid_up_to: float, budget: float
+    path: ScanPath,
+    limits: MachineLimits,
+    valid_up_to: float,
+    budget: float,
+    dynamics: TransferFunction | None = None,
 ) -> tuple[list[SpeedLimit], list[str]]:
     """Return the limits that can be evaluated, and the names of those that cannot.
 
     valid_up_to: frequency to which the calibration is trusted [Hz]
+    dynamics: from encoder to probe, by which the probe leaves the path beyond the servo
     budget: allowed error of a height, k = 2 [m], for what exposure and timing cost
     """
     evaluated, missing = [], []
-    for limit in _all_limits(path, limits, valid_up_to, budget):
+    for limit in _all_limits(path, limits, valid_up_to, budget, dynamics):
         if isinstance(limit, str):
             missing.append(limit)
         else:
@@ -201,13 +206,17 @@ def speed_limits(
 
 
 def _all_limits(
-    path: ScanPath, limits: MachineLimits, valid_up_to: float, budget: float
+    path: ScanPath,
+    limits: MachineLimits,
+    valid_up_to: float,
+    budget: float,
+    dynamics: TransferFunction | None,
 ) -> Iterator[SpeedLimit | str]:
     content = content_frequency(path.z, path.sample_period)
     velocity, acceleration, jerk = steepest(path.z, path.sample_period, content)
     yield _power("calibrated band", content, valid_up_to, "Hz", 1)
     yield _power("motion frequency", content, limits.motion_frequency, "Hz", 1)
-    yield _following(path, limits)
+    yield _following(path, limits, dynamics)
     yield _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2)
     yield _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3)
     yield _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1)
@@ -268,29 +277,39 @@ def steepest(z: FloatArray, sample_period: float, content: float) -> tuple[float
 
 
 def following_error(
-    z: FloatArray, sample_period: float, servo_frequency: float, factor: float = 1.0
+    z: FloatArray,
+    sample_period: float,
+    servo_frequency: float,
+    factor: float = 1.0,
+    dynamics: TransferFunction | None = None,
 ) -> float:
-    """Return the largest distance [m] by which the servo leaves the path run at ``factor``.
+    """Return the largest distance [m] by which the probe leaves the path run at ``factor``.
 
-    The servo is 1 / (1 + s/ω)²; run faster, the path is the same over less time.
+    The servo is 1 / (1 + s/ω)², and ``dynamics`` what the probe's motion is of the encoder's; run
+    faster, the path is the same over less time.
     """
     omega = 2 * np.pi * servo_frequency
-    servo = TransferFunction(np.ones(1), np.array([1.0, 2 / omega, 1 / omega**2]))
-    recursion = Recursion(discretise(servo, sample_period / factor))
+    motion = TransferFunction(np.ones(1), np.array([1.0, 2 / omega, 1 / omega**2]))
+    if dynamics is not None:
+        both = np.asarray(np.convolve(motion.denominator, dynamics.denominator), np.float64)
+        motion = TransferFunction(dynamics.numerator, both, dynamics.delay)
+    recursion = Recursion(discretise(motion, sample_period / factor))
     recursion.start(past_motion(z[:_START_SAMPLES]))
     # The past before the first sample is guessed; its response is over after ten time constants.
     settling = min(int(10 / omega / (sample_period / factor)), len(z) // 2)
     return float(np.max(np.abs(z - recursion.run(z))[settling:]))
 
 
-def _following(path: ScanPath, limits: MachineLimits) -> SpeedLimit | str:
+def _following(
+    path: ScanPath, limits: MachineLimits, dynamics: TransferFunction | None
+) -> SpeedLimit | str:
     name = "probe range against following error"
     if limits.probe_range is None or limits.servo_frequency is None:
         return name
     servo = limits.servo_frequency
 
     def excursion(factor: float) -> float:
-        return following_error(path.z, path.sample_period, servo, factor)
+        return following_error(path.z, path.sample_period, servo, factor, dynamics)
 
     now, taken, share = excursion(1.0), 0.0, 1.0
     if path.distance is not None and np.any(np.isfinite(path.distance)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.limits import (
     FASTEST,
     MachineLimits,
@@ -65,6 +66,17 @@ def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: fl
     lost = abs(1 - 1 / (1 + 1j * FREQUENCY * factor / servo) ** 2)
     found = following_error(SINE, PERIOD, servo, factor)
     assert found == pytest.approx(AMPLITUDE * lost, rel=2e-3)
+
+
+@pytest.mark.parametrize("factor", [1.0, 7.0])
+def test_what_lags_behind_the_encoder_leaves_the_path_too(factor: float) -> None:
+    lag, servo = 0.34e-3, 50.0
+    structure = TransferFunction(np.ones(1), np.array([1.0, lag]))
+    s = 2j * np.pi * FREQUENCY * factor
+    lost = abs(1 - 1 / (1 + s / (2 * np.pi * servo)) ** 2 / (1 + s * lag))
+    found = following_error(SINE, PERIOD, servo, factor, structure)
+    assert found == pytest.approx(AMPLITUDE * lost, rel=2e-3)
+    assert found > 1.03 * following_error(SINE, PERIOD, servo, factor)
 
 
 def test_the_papers_scan_at_1221_rpm_leaves_the_probes_range() -> None:
