@@ -24,7 +24,7 @@ from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
-from omsm_ros.errors import ConfigurationError, OmsmError
+from omsm_ros.errors import ConfigurationError, FileError, OmsmError
 from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
 from omsm_ros.jobs.remember import remembered
 from omsm_ros.nodes.aside import Aside
@@ -37,6 +37,7 @@ from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.parameters import Parameter
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_folder import CalibrationFolder
+from omsm_ros.storage.claim import claimed
 
 PARAMETERS = (
     Parameter("buffer_samples", 3_600_000, "samples kept per topic", quantities.BUFFER_SAMPLES),
@@ -71,6 +72,7 @@ class CalibratorNode(ManagedNode):
         self._refused = dict.fromkeys(_STREAMS, 0)
         self._recent = RecentIncrease()
         self._last, self._trouble = "nothing identified yet", ""
+        self._claim(undo)
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
         self._aside = Aside(self, undo)
         self._aside.serve(undo, Identify, "~/identify", self._on_identify)
@@ -104,6 +106,14 @@ class CalibratorNode(ManagedNode):
         self._probe = told
 
     # ------------------------------------------------------------------- what is in force
+
+    def _claim(self, undo: ExitStack) -> None:
+        """Keep a second cell from taking this one's calibrations for its own."""
+        try:
+            undo.enter_context(claimed(self._folder.link))
+        except FileError as err:  # where nothing can be kept, a calibration is told all the same
+            self._trouble = str(err)
+            self.get_logger().error(self._trouble)
 
     def _take_up(self) -> None:
         """Tell what was in force before this start."""

@@ -1,4 +1,4 @@
-"""Two emulators do not offer one port: who comes second is refused."""
+"""Two emulators do not offer one port, two calibrators keep no one file: the second is refused."""
 
 from __future__ import annotations
 
