@@ -12,7 +12,7 @@ from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, form_rows
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.surface.freedoms import AUTO
-from omsm_ros.jobs.compensate_form import COMPENSATION, compensate_form
+from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
 from omsm_ros.jobs.judge_form import judge_form
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
@@ -79,20 +79,33 @@ def _declare_compensate(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--unit", **UNIT)
+    sub.add_argument(
+        "--spiral",
+        type=number(quantities.SPACING),
+        metavar="FEED",
+        help=f"a turn of the next cut [m]: writes {PATH}, offsets of Z over X and C, as G-code",
+    )
+    sub.add_argument(
+        "--per-turn", type=number(quantities.PER_TURN), default=360, help="places of the spiral"
+    )
     declare_fit(sub, (AUTO,))
 
 
 def _compensate(args: argparse.Namespace) -> Facts:
     surface = load_surface(args.nominal)
-    with result_folder(args.out, (COMPENSATION,)) as out:
+    spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
+    with result_folder(args.out, (COMPENSATION, PATH)) as out:
         points = open_measurement(args.measured, args.unit)
-        return compensate_form(points, surface, out, args.low_pass, args.fit, args.aperture)
+        return compensate_form(points, surface, out, args.low_pass, args.fit, args.aperture, spiral)
 
 
 def _show_compensate(facts: Facts) -> None:
     lengths = ("rms_before", "rms_after", "largest_offset", "largest_uncertainty", "low_pass")
     rows = [(name.replace("_", " "), quantity(facts[name], "m")) for name in lengths]
+    rows += [("warning", text) for text in facts["warnings"]]
     rows += [("not evaluated", text) for text in facts["not_evaluated"]]
+    if "path" in facts:
+        rows += [("along the spiral", f"{facts['path']}, {facts['path_places']} places")]
     table(
         [*rows, ("sign", facts["sign"]), ("written", f"{facts['file']}, {facts['places']} places")]
     )

@@ -7,6 +7,7 @@ import pytest
 from scipy.interpolate import LinearNDInterpolator
 
 from omsm_ros.cli.main import main
+from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.surface.freeforms import ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.storage.surface_file import load_surface
@@ -74,3 +75,40 @@ def test_a_low_pass_finer_than_the_points_is_refused(folder, tmp_path, capsys):
     assert compensate(folder, tmp_path / "out", "--low-pass", "0.0001") == 2
     assert "finer than the points tell" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
+    """Read as the controller would, at the place that the machine's axes put under the tool."""
+    assert compensate(folder, tmp_path, "--low-pass", "0.004", "--spiral", "2e-4", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    lines = (tmp_path / "compensation.nc").read_text().splitlines()
+    assert "millimetres" in lines[2]
+    moves = [[float(word[1:]) for word in line.split()] for line in lines if line[0] == "X"]
+    assert len(moves) == facts["path_places"]
+    radius, angle, offset = np.array(moves).T * [[1e-3], [np.pi / 180], [1e-3]]
+    part = workpiece_xy(radius, np.zeros(len(radius)), angle)
+    before = error(*part)
+    inner = radius < 0.65 * RADIUS
+    # Places of the spiral lie the closer together the nearer they are to its centre.
+    weights = radius[inner]
+    rms = []
+    for left in (before[inner], (before + offset)[inner]):
+        level = np.average(left, weights=weights)
+        rms.append(np.sqrt(np.average((left - level) ** 2, weights=weights)))
+    assert rms[0] > 3 * rms[1]
+    assert rms[1] == pytest.approx(4e-9 / np.sqrt(2), rel=0.35)
+    assert facts["warnings"] == []
+    assert facts["surer_than_zero"] > 0.8
+
+
+def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys):
+    """A shift that form looks like is open by tens of nanometres."""
+    words = ("--low-pass", "0.004", "--fit", "auto", "--json")
+    assert compensate(folder, tmp_path, *words) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert "less than twice its uncertainty" in facts["warnings"][0]
+
+
+def test_a_spiral_too_fine_for_a_controller_is_refused(folder, tmp_path, capsys):
+    assert compensate(folder, tmp_path / "o", "--low-pass", "0.004", "--spiral", "1e-8") == 2
+    assert "take a wider feed" in capsys.readouterr().err

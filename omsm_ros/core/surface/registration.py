@@ -259,7 +259,10 @@ class _Fit:
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             step = found.step * own
             settled = max(_SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
-            if turn > 3 and float(np.max(np.abs(step))) < settled:
+            # Of all freedoms together: what x does a tilt may undo.
+            gram = sums.gram[: len(step), : len(step)]
+            square = float(found.step @ gram @ found.step) / sums.points
+            if turn > 3 and square < settled**2:
                 smooth = np.concatenate([found.step, found.form]) @ columns
                 limit = limit_of(points.deviation - smooth)
                 return _Stand(at, like, limit, found, sums)
