@@ -13,10 +13,11 @@ from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
 from omsm_ros.report.common import style
-from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Of the aperture: the half width of a profile's band in places, and the places of a stretch.
 _HALF_WIDTH_PLACES, _STRETCH_PLACES = 1.5, 1.5
+_MOST_DIGITS = 5000
 _LINES = {"profile_x": (0.0, "along x", "x"), "profile_y": (np.pi / 2, "along y", "y")}
 
 
@@ -52,9 +53,10 @@ def profiles(found: Comparison) -> dict[str, Figure]:
 def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position: str) -> Figure:
     made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
+    unit, name_of_unit = _unit(cuts[:2])
     for cut, colour, name in zip(cuts, (style.BEFORE, style.AFTER), "AB", strict=False):
-        _line(upper, cut, color=colour, label=name)
-    _line(lower, cuts[2], color=style.TRUTH, label="A − B")
+        _line(upper, cut, unit, color=colour, label=name)
+    _line(lower, cuts[2], NANOMETRE_M, color=style.TRUTH, label="A − B")
     if band is not None:
         bound = COVERAGE_FACTOR * band.value / NANOMETRE_M
         lower.fill_between(
@@ -63,13 +65,20 @@ def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position
         )  # fmt: skip
     style.legend_above(upper)
     style.legend_above(lower)
-    style.label(upper, y="height [nm]", title=title)
+    style.label(upper, y=f"height [{name_of_unit}]", title=title)
     style.label(lower, x=f"{position} [mm]", y="A − B [nm]")
     return made
 
 
-def _line(axes: Axes, drawn: Profile, **look: str) -> None:
-    axes.plot(drawn.position / MILLIMETRE_M, drawn.value / NANOMETRE_M, linewidth=1.1, **look)
+def _unit(cuts: Sequence[Profile]) -> tuple[float, str]:
+    """Return the unit in which their heights have no more than four digits, and its name."""
+    largest = max(float(np.nanmax(np.abs(cut.value), initial=0.0)) for cut in cuts)
+    units = ((NANOMETRE_M, "nm"), (MICROMETRE_M, "µm"), (MILLIMETRE_M, "mm"))
+    return next((u for u in units if largest < _MOST_DIGITS * u[0]), units[-1])
+
+
+def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
+    axes.plot(drawn.position / MILLIMETRE_M, drawn.value / unit, linewidth=1.1, **look)
 
 
 def terms(numbers: Sequence[TermNumber]) -> Figure:
