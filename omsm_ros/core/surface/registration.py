@@ -154,7 +154,9 @@ def _coarse(
         at = at.moved(names, step[0] / scale)
         # The refinement that follows converges from far more.
         settled = max(_SHARE_OF_SPREAD * scatter.spread(points.deviation), _SETTLED_M)
-        if turn > 1 and float(np.max(np.abs(step[0]))) < settled:
+        # Of all freedoms together: what x does a tilt may undo.
+        moved = float(np.sqrt(np.mean((step[0] @ (columns / scale[:, np.newaxis])) ** 2)))
+        if turn > 1 and moved < settled:
             return at
     raise DataError(
         "the points do not settle on the nominal surface; check its parameters, the sign of its "
