@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, cell_of, number
+from omsm_ros.cli.arguments import add_bags, add_trigger, cell_of, number, trigger_of
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
@@ -26,6 +26,7 @@ from omsm_ros.core.machine.step_plan import (
 from omsm_ros.core.verification.change import compare
 from omsm_ros.core.verification.repeatability import Repeatability, repeatability
 from omsm_ros.errors import CalibrationError
+from omsm_ros.jobs.establish_offset import established_offset
 from omsm_ros.jobs.verify_calibration import path_check_of
 from omsm_ros.readable import quantity
 from omsm_ros.storage.calibration_file import load_calibration, save_calibration
@@ -40,12 +41,22 @@ from omsm_ros.units import DEGREE_RAD
 def _declare_verify(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
+    add_trigger(sub)
+    sub.add_argument(
+        "--find-offset",
+        action="store_true",
+        help="establish the counter offset by the motion itself; use it for --counter-offset",
+    )
 
 
 def _verify(args: argparse.Namespace) -> Facts:
-    calibration = load_calibration(args.calibration)
+    calibration, bag = load_calibration(args.calibration), cell_of(args.bag, args)
+    trigger, established = trigger_of(args), None
     with progress_bar("reading", args.json) as progress:
-        check = path_check_of(cell_of(args.bag, args), calibration, progress)
+        if args.find_offset:
+            established = established_offset(bag, calibration, progress)
+            trigger = replace(trigger, counter_offset=established.samples)
+        check = path_check_of(bag, calibration, progress, trigger)
     bands = [
         {
             "from": low,
@@ -58,7 +69,8 @@ def _verify(args: argparse.Namespace) -> Facts:
         for low, high in check.excited
         if np.any(inside := (check.frequency >= low) & (check.frequency < high))
     ]
-    return {"rms_before": check.rms_before, "rms_after": check.rms_after, "bands": bands}
+    facts: Facts = {"rms_before": check.rms_before, "rms_after": check.rms_after, "bands": bands}
+    return facts | ({"counter_offset": asdict(established)} if established else {})
 
 
 def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
@@ -66,6 +78,11 @@ def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
 
 
 def _show_verify(facts: Facts) -> None:
+    if offset := facts.get("counter_offset"):
+        print(
+            f"counter offset {offset['samples']} samples; left of it "
+            f"{offset['fraction']:.3f} ± {offset['uncertainty']:.3f} (k = 1)"
+        )
     print("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
     for band in facts["bands"]:
         errors = (quantity(band[f"error_{w}"], "m") for w in ("before", "after"))

@@ -9,6 +9,7 @@ from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.core.verification.free_path import PathCheck, check_path
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.read_bag import Progress, no_progress
@@ -18,10 +19,16 @@ _START_SAMPLES = 12
 
 
 def path_check_of(
-    path: AnyBag, calibration: Calibration, progress: Progress = no_progress
+    path: AnyBag,
+    calibration: Calibration,
+    progress: Progress = no_progress,
+    trigger: CommonTrigger = EQUAL_COUNTS,
 ) -> PathCheck:
-    """The paper's Fig. 9: errors and phase lags of a free path on a fixed target."""
-    record = motion_of_bag(path, progress=progress)
+    """The paper's Fig. 9: errors and phase lags of a free path on a fixed target.
+
+    trigger: what is stated of the counters of axes and distance
+    """
+    record = motion_of_bag(path, trigger=trigger, progress=progress)
     recursion = Recursion(discretise(calibration.dynamics, record.sample_period))
     recursion.start(past_motion(record.z[:_START_SAMPLES]))
     return check_path(

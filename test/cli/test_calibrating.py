@@ -9,8 +9,9 @@ from omsm_ros import cli
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.trajectories import Chirp
 from omsm_ros.core.surface.nominal import Flat
-from omsm_ros.storage import calibration_file
-from omsm_ros.twin.cell import Cell, record
+from omsm_ros.storage import bags, calibration_file
+from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.twin.cell import Cell, blocks_of, record
 
 from .written import facts, write
 
@@ -51,6 +52,26 @@ def test_verify_on_a_chirp(capsys, tmp_path, calibration):
     band = next(b for b in found["bands"] if b["from"] == 10)
     assert np.degrees(band["lag_before"]) == pytest.approx(0.1223 * 10.5, rel=0.03)
     assert abs(np.degrees(band["lag_after"])) < 0.02
+
+
+@pytest.mark.parametrize("ahead", [0, 37])
+def test_verify_finds_the_offset_of_two_counters(capsys, tmp_path, calibration, ahead):
+    """The probe's counter is ``ahead``: without the offset, nothing is paired rightly."""
+    path = tmp_path / "chirp.mcap"
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in blocks_of(record(Cell(), Chirp(duration=10.0), Flat()), 100):
+            bag.write_axes(axes)
+            bag.write_distance(replace(distance, first_sample=distance.first_sample + ahead))
+    known = ("verify", path, "--calibration", calibration)
+    found = facts(capsys, *known, "--find-offset")
+    assert found["counter_offset"]["samples"] == -ahead
+    assert abs(found["counter_offset"]["fraction"]) < 0.05
+    assert found["rms_after"] < 12e-9
+    if ahead:
+        assert cli.main([*map(str, known)]) == 2
+        assert "slipped" in capsys.readouterr().err
+        stated = facts(capsys, *known, "--counter-offset", -ahead)
+        assert stated["rms_after"] == found["rms_after"]
 
 
 def test_compare_sees_a_change_and_only_a_change(capsys, tmp_path, true_calibration):

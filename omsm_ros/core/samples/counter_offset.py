@@ -1,0 +1,158 @@
+"""By how much do the trigger counts of two devices differ? What the motion itself says.
+
+Before a fixed target the distance is ``d = a + b n - g z``, and only at the right offset does the
+distance at one count answer to Z at the other. The offset of the least residual is searched among
+whole samples; what is left of it, a fraction, is fitted there: ``d = a + b n - g (z + δ ż T)``. A
+probe or a structure that is late looks like a part of a sample, so the lag must be small against
+one, or known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import DataError
+
+# Before a fixed target g is 1 to some per cent; a followed surface gives anything.
+_GAIN = (0.8, 1.25)
+# The residual elsewhere must be so many times that at the offset: a motion that repeats itself,
+# or hardly moves, fits at several.
+_CONTRAST = 1.5
+# Offsets nearer than this are the flank of one minimum; the fit judges them [samples].
+_FLANK = 3
+_LEAST_SAMPLES = 200
+# The whole number is sure if the fraction and three of its uncertainties leave room to the next.
+_ROOM, _SURE = 0.5, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class CounterOffset:
+    """samples: added to the distance's count, it gives the axes' count
+
+    fraction: of a sample that the fit leaves, after the known lag;  uncertainty: of it (k = 1)
+    """
+
+    samples: int
+    fraction: float
+    uncertainty: float
+
+
+def counter_offset(
+    z: FloatArray,
+    distance: FloatArray,
+    ok: NDArray[np.bool_],
+    *,
+    most: int,
+    lag: float = 0.0,
+    lag_uncertainty: float = 0.1,
+) -> CounterOffset:
+    """Return the offset of two counters from a motion before a fixed target.
+
+    z, distance: at equal counts [m], (n,);  ok: where the distance is one, (n,)
+    most: the largest offset that is searched [samples]
+    lag, lag_uncertainty: of the distance behind Z, as far as it is known [samples]
+
+    Raises DataError where the motion does not say which offset it is, with the reason.
+    """
+    if np.count_nonzero(ok) < max(_LEAST_SAMPLES, 4 * most):
+        raise DataError(
+            f"{np.count_nonzero(ok)} samples with a distance cannot tell an offset of up to "
+            f"{most} samples; record {max(_LEAST_SAMPLES, 4 * most)} or more before a fixed target"
+        )
+    left = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, most)
+    best = int(np.argmin(left))
+    elsewhere = np.delete(_between(left), np.s_[max(0, best - _FLANK) : best + _FLANK + 1])
+    contrast = float(elsewhere.min() / max(left[best], np.finfo(float).tiny))
+    if contrast < _CONTRAST:
+        raise DataError(
+            f"the motion fits at several offsets (least residual elsewhere {contrast:.3g} times "
+            f"that at {best - most} samples, {_CONTRAST} asked for); move Z unevenly by many times "
+            "the noise before a fixed target, or state counter_offset"
+        )
+    return _refined(z, distance, ok, best - most, lag, lag_uncertainty)
+
+
+def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArray:
+    """Values (n,) without their mean."""
+    return values - float(np.mean(values if ok is None else values[ok]))
+
+
+def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -> FloatArray:
+    """Share of the distance's variance that Z leaves at offsets -most … most, (2 most + 1,)."""
+    weight = ok.astype(np.float64)
+
+    def lagged(a: FloatArray, b: FloatArray) -> FloatArray:
+        whole = correlate(a, b, mode="full", method="fft")
+        middle = len(b) - 1
+        return np.asarray(whole[middle - most : middle + most + 1])
+
+    inside = np.ones(len(z))
+    n, sz, szz = lagged(inside, weight), lagged(z, weight), lagged(z * z, weight)
+    sd, sdd, szd = lagged(inside, d), lagged(inside, d * d), lagged(z, d)
+    vz, vd = szz - sz**2 / n, sdd - sd**2 / n
+    shared = (szd - sz * sd / n) ** 2
+    return np.asarray(np.clip(1.0 - shared / np.maximum(vz * vd, np.finfo(float).tiny), 0.0, 1.0))
+
+
+def _between(left: FloatArray) -> FloatArray:
+    """Least residual within a sample of each offset (n,): the vertex of the parabola there."""
+    before, here, after = left[:-2], left[1:-1], left[2:]
+    bend, tilt = before - 2 * here + after, (after - before) / 2
+    inside = (bend > 0) & (abs(tilt) <= bend)
+    vertex = here - np.where(inside, tilt**2 / (2 * np.where(inside, bend, 1.0)), 0.0)
+    return np.concatenate([left[:1], np.maximum(vertex, 0.0), left[-1:]])
+
+
+def _refined(
+    z: FloatArray,
+    distance: FloatArray,
+    ok: NDArray[np.bool_],
+    samples: int,
+    lag: float,
+    lag_uncertainty: float,
+) -> CounterOffset:
+    """Fit the fraction of a sample that is left at ``samples``, and judge it."""
+    index = np.flatnonzero(ok)
+    index = index[(index + samples >= 1) & (index + samples < len(z) - 1)]
+    here = index + samples
+    speed = (z[here + 1] - z[here - 1]) / 2
+    columns = np.stack([np.ones(len(here)), index - index.mean(), z[here], speed], axis=1)
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    solved, *_ = np.linalg.lstsq(columns / scale, distance[index], rcond=None)
+    residual = distance[index] - columns / scale @ solved
+    gain, moved = -solved[2] / scale[2], -solved[3] / scale[3]
+    if not _GAIN[0] < abs(gain) < _GAIN[1]:
+        raise DataError(
+            f"the distance answers to Z with {gain:.3g}, before a fixed target it is 1 "
+            f"({_GAIN[0]} to {_GAIN[1]}); record a motion of Z before a fixed target, or state "
+            "counter_offset"
+        )
+    inverse = np.linalg.pinv((columns / scale).T @ (columns / scale))
+    # Neighbouring residuals are alike: so many samples count as one.
+    alike = _correlation_length(residual)
+    spread = math.sqrt(float(residual @ residual) / max(len(here) - 4, 1) * alike * inverse[3, 3])
+    uncertainty = math.hypot(spread / scale[3] / gain, lag_uncertainty)
+    # Late by ``lag``, the distance shows where Z was: the offset found is smaller by it.
+    found = samples + moved / gain + lag
+    whole = round(found)
+    if abs(found - whole) + _SURE * uncertainty > _ROOM:
+        raise DataError(
+            f"the counters differ by {found:.2f} ± {uncertainty:.2f} samples, which is no whole "
+            "number; move Z faster before a fixed target, state the lag, or state counter_offset"
+        )
+    return CounterOffset(whole, found - whole, uncertainty)
+
+
+def _correlation_length(residual: FloatArray) -> float:
+    """Samples (≥ 1) that count as one, of a first-order process with this correlation."""
+    total = float(residual @ residual)
+    near = float(residual[1:] @ residual[:-1]) / total if total > 0 else 0.0
+    near = min(max(near, 0.0), 0.999)
+    return (1 + near) / (1 - near)
