@@ -101,7 +101,10 @@ class ChrocodileDevice(Chrocodile):
         self._transport.write(wire)
         deadline = self._monotonic() + (patience or self._wanted.patience)
         while True:
-            self._early += self._stream.feed(self._transport.read(_READ_S))
+            data = self._transport.read(_READ_S)
+            self._early += self._stream.feed(data)
+            if not data:
+                self._stream.settle_answer()
             answer = self._stream.take_answer()
             if answer is not None:
                 return answer

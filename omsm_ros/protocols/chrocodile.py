@@ -21,7 +21,11 @@ MAX_COMMAND_BYTES = 1024
 
 _NAME = re.compile(r"[A-Z]{3,}")
 _COMMAND = re.compile(rb"\$([A-Z]{3,})([^A-Z].*)?", re.DOTALL)
-_READY = re.compile(rb"ready(?:\r\n|\r(?!\n)(?=.)|\n)", re.DOTALL)
+# With what ends its line, or without where a telegram follows at once.
+_READY = re.compile(
+    rb"ready(?: *(?:\r\n|\r(?!\n)(?=.)|\n)|(?=[\x80-\xff])|(?= +[-+.\d]))",
+    re.DOTALL | re.IGNORECASE,
+)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -132,6 +136,12 @@ class DollarStream:
                 self._held = b""
         return [records for records in found if len(records)]
 
+    def settle_answer(self) -> None:
+        """End an answer whose ``ready`` nothing follows: the line is silent."""
+        if self._answering and self._held.rstrip().lower().endswith(b"ready"):
+            self._held = self._held.rstrip() + b"\r\n"
+            self._receive()
+
     def settle(self) -> list[Records]:
         """The last telegram before a silence, if it is whole."""
         if self._answering or self.decoder is None:
@@ -142,17 +152,19 @@ class DollarStream:
 
     def _listen(self, found: list[Records]) -> bool:
         """Telegrams up to the echo; whether it has come."""
-        place = self._held.find(self._pending)
+        # Some echo neither the CR nor the case.
+        echo, held = self._pending.rstrip(b"\r").lower(), self._held.lower()
+        place = held.find(echo)
         if place < 0:
             # Keep what may be the beginning of the echo.
-            keep = _overlap(self._held, self._pending)
+            keep = _overlap(held, echo)
             found += self._decode(self._held[: len(self._held) - keep])
             self._held = self._held[len(self._held) - keep :]
             return False
         found += self._decode(self._held[:place])
         if self.decoder is not None:
             found.append(self.decoder.settle())  # commands begin where a telegram ended
-        self._held = self._held[place + len(self._pending) :]
+        self._held = self._held[place + len(echo) :]
         self._answering, self._pending = self._pending, b""
         return True
 

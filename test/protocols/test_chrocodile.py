@@ -161,3 +161,40 @@ def test_an_endless_answer_is_bounded() -> None:
 )
 def test_numbers_of_an_answer(text: str, numbers: tuple[float, ...]) -> None:
     assert Answer(b"", text).numbers == numbers
+
+
+@pytest.mark.parametrize("echo", [b"$AVD ?\r", b"$AVD ?", b"$AVD ?\r\n", b"$avd ?\r"])
+@pytest.mark.parametrize(
+    "ready", [b"ready\r\n", b"ready\n", b"ready", b"ready\r", b" ready \r\n", b"Ready\r\n"]
+)
+@pytest.mark.parametrize("portion", [1, 5, 100])
+def test_other_ways_to_echo_and_to_end_are_understood(
+    echo: bytes, ready: bytes, portion: int
+) -> None:
+    made = DollarStream()
+    made.expect(command("AVD", "?"))
+    wire = echo + b"12\r\n" + ready
+    for start in range(0, len(wire), portion):
+        made.feed(wire[start : start + portion])
+    made.settle_answer()  # nothing more comes
+    answer = made.take_answer()
+    assert answer is not None
+    assert answer.numbers == (12.0,)
+
+
+@pytest.mark.parametrize("telegram", [b"\xff\xff\x00\x07", b" 7 1.5"])
+def test_a_telegram_may_follow_ready_at_once(telegram: bytes) -> None:
+    made = DollarStream()
+    made.expect(command("STA"))
+    made.feed(b"$STA\rready" + telegram)
+    assert made.take_answer() == Answer(command("STA"), "")
+
+
+def test_an_answer_that_goes_on_is_not_ended_by_a_pause() -> None:
+    made = DollarStream()
+    made.expect(command("VER"))
+    made.feed(b"$VER\rCHRocodile 2")
+    made.settle_answer()
+    assert made.take_answer() is None
+    made.feed(b" S\r\nready\r\n")
+    assert made.take_answer() == Answer(command("VER"), "CHRocodile 2 S")
