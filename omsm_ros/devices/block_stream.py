@@ -46,6 +46,7 @@ class BlockStreamDevice(StreamDevice):
         counting = Counting(COUNTER_RANGE, timed=False, period=period)
         super().__init__(transport, settings, channels, counting, now_ns, monotonic)
         self._decoder = BlockDecoder(kind, self._frame)
+        self._unread = 0
         self._commands, self._answers_within = commands, patience
         self._identity: dict[str, str] = {}
 
@@ -60,6 +61,7 @@ class BlockStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         self._decoder.reset()
+        self._unread = 0
         if self._commands is None:
             return
         within = self._answers_within
@@ -75,7 +77,11 @@ class BlockStreamDevice(StreamDevice):
             frames = block.frames.reshape(-1).view(self._frame(block.kind))
             counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
             parts.append(self._samples_of(frames, counter))
+        self._unread = 0 if parts else self._unread + len(data)
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _listen_in(self, silent: float) -> None:
+        self._check_understood(silent, self._unread)
 
     # --- what a model fills in
 

@@ -122,6 +122,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         return samples
 
     def _listen_in(self, silent: float) -> None:
+        super()._listen_in(silent)
         if not self._wanted.triggered and silent > self._wanted.patience:
             raise DeviceError(
                 f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"

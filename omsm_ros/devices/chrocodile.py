@@ -251,7 +251,10 @@ class Chrocodile(StreamDevice):
         if said:
             hint = f"it sends {said[-32:]!r}: another baud rate, or no CHRocodile is there"
         else:
-            hint = "check power, cable, and (on a serial line) the baud rate, 115200 by default"
+            hint = (
+                "check power, cable, and that this is the device's port: by TCP 7890 (packets "
+                "7891), on a serial line at the right baud rate, 115200 by default"
+            )
         return DeviceTimeoutError(f"{self._transport.name} did not answer {name!r}; {hint}")
 
     # --- reading

@@ -215,6 +215,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         return counts
 
     def _listen_in(self, silent: float) -> None:
+        super()._listen_in(silent)
         _must_talk(self._transport.name, self._wanted, silent)
 
 

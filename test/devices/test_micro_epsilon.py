@@ -251,3 +251,25 @@ def test_a_channel_it_does_not_have_is_named(bench: Any) -> None:
 def test_senseless_settings_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(ConfigurationError):
         make()
+
+
+@pytest.mark.parametrize(
+    ("device", "wanted"),
+    [
+        (ConfocalDtEthernetDevice, ConfocalDtSettings(trigger="each")),
+        (CapaNcdtDevice, CapaNcdtSettings(triggered=True)),
+    ],
+)
+def test_another_service_on_the_port_is_told_though_a_trigger_may_be_waited_for(
+    bench: Any, device: Any, wanted: Any
+) -> None:
+    class Banner(Instrument):
+        def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:
+            return [b"SSH-2.0-OpenSSH_9.6\r\n"] * len(measured)
+
+    run = bench(Banner, device, wanted)
+    run.run(4.0)
+    assert "no samples of this device" in run.troubles[0]
+    quiet = bench(Banner, device, wanted, triggered=True)
+    quiet.run(4.0)
+    assert quiet.troubles == []
