@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.samples.counter_offset import counter_offset
+from omsm_ros.core.verification.counter_offset import counter_offset
 from omsm_ros.errors import DataError
 
 N, NOISE = 6000, 10e-9
