@@ -12,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.scatter import spread
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
@@ -157,7 +158,7 @@ def _line(
     uncertainty = np.inf
     for _ in range(_ITERATIONS):
         residual = y - offset - slope * x
-        scale = max(_LEAST_SCALE_S, 1.4826 * float(np.median(abs(residual))))
+        scale = max(_LEAST_SCALE_S, spread(residual))
         weight = count * np.minimum(1.0, _HUBER * scale / np.maximum(abs(residual), 1e-12))
         total = weight.sum()
         mx, my = float((weight * x).sum() / total), float((weight * y).sum() / total)

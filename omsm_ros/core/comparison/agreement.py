@@ -21,17 +21,19 @@ from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_value
 
 # Of some 95 % (GUM 6.3.3).
 COVERAGE_FACTOR = 2.0
+# From power to the order of the sixth, which tolerances of form name.
 TERMS: tuple[Term, ...] = terms_up_to(6, 2)
+# Of the area (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST_SHARE = 0.995
 
-_TOGETHER = 0.95
+# Of pairs that agree: in all terms at once, and in the place that is farthest off.
+_TOGETHER, _PERCENTILE = 0.95, 99.0
 # A share of 95 % of so many draws is known to 1.3 %, one of 99 % to 0.6 %.
 _DRAWS = 300
 # Above it the width of the filter is no whole place.
 _HARDLY_SMOOTHED = 0.7
 # A term of which the others explain all but this share is not told from them.
 _LEAST_OWN_SHARE = 1e-4
-_PERCENTILE = 99.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,10 +14,13 @@ from omsm_ros.readable import quantity
 
 # The orders that are judged; left in, they would bend within a cell.
 _TREND_DEGREE = 6
+# Seven hundred for each of its 28 terms.
 _TREND_POINTS = 20_000
 # Twice as large cells are a quarter as many where the points fill the surface.
 _FILLED = 3.5
+# A wave of the sixth order has nearly three of them.
 _FEWEST_CELLS_ACROSS = 8
+# Points at a time: eighteen neighbours of each, of six columns, are 17 MB.
 _PORTION = 20_000
 
 

@@ -25,8 +25,10 @@ clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
 _SIDEWAYS = ("x", "y", "clocking")
+# Each turn squares what is left; a thousandth of a place is beneath what resampling knows.
 _TURNS = 8
 _SETTLED = 1e-3
+# Four for each of the 25 terms that are judged.
 _FEWEST_PLACES = 100
 # A freedom whose column the others explain but for this share is none of its own.
 _LEAST_OWN_SHARE = 1e-3

@@ -18,6 +18,7 @@ _LEAST_PROBABILITY = 0.01
 _UNLIKELY = 0.05
 # What is beyond one but not by this is as well chance as a difference.
 _PLAINLY_BEYOND = 1.25
+# Of the smaller area: of less, the figures are those of another part.
 _LEAST_SHARED = 0.5
 
 

@@ -26,6 +26,7 @@ from omsm_ros.quantities import ANGLE, POSITION
 
 SET_SCHEMA = "omsm-calibration-set/1"
 AXES = ("x", "z", "b")
+# Every 13 mm of a travel of 250 mm; each costs its filter at every sample.
 MOST_MEMBERS = 20
 # Noise of the encoder at the last place, and a path that ends there, are not beyond it.
 _MARGIN = 0.01

@@ -23,6 +23,7 @@ from omsm_ros.units import MICROMETRE_M
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 
+# The slope of a wave of a millimetre is short by 0.07 %, and rounding far below a microradian.
 _SLOPE_STEP_M = 10 * MICROMETRE_M
 # Without a nominal surface its slopes come from a polynomial through the points.
 _POLYNOMIAL_DEGREE = 6

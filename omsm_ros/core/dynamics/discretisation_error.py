@@ -24,6 +24,7 @@ _FADE = 0.1
 _BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
 # A motion that fills more of the Nyquist band is not resolved by its samples.
 _RESOLVED_SHARE = 0.2
+# Up to the highest that there is, whose noise gain is 1.3 for the paper's dynamics.
 ORDERS = (1, 2, 3, 4, 5, 7)
 
 

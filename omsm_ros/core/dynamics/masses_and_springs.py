@@ -24,6 +24,7 @@ from omsm_ros.errors import DataError, IdentificationError
 
 # What a fit finds, in the order of its uncertainties; m1 is given.
 FITTED = ("m2", "k1", "k2", "c1", "c2")
+# Times twenty over three decades: 0.2 % apart, closer than the width of any mode of metal.
 _LINES = 200
 # Natural logarithm of how far from its guess a mass or a spring may come out.
 _SEARCHED = 8.0
@@ -31,6 +32,7 @@ _SEARCHED = 8.0
 _LEAST_PROMINENCE = 1e-6
 # Of the stated uncertainty, where no coefficient could follow the model.
 _UNSTATED = 0.1
+# Of the greatest eigenvalue of a correlation; rounding leaves less.
 _INDEFINITE = 1e-9
 # The six guesses race for this many steps; the best of them is followed to its end.
 _RACE_EVALUATIONS = 8

@@ -22,6 +22,7 @@ from omsm_ros.least_squares import least_squares
 _ITERATIONS = 8
 # Rows of past and of future beyond the highest order.
 _SPARE_ROWS = 5
+# Thirty times its rows at the highest order; more only cost time.
 _MAX_COLUMNS = 5000
 
 

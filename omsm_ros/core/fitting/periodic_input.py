@@ -11,9 +11,11 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Long enough that a bridge across the whole travel adds nothing near the fastest motion.
 _BRIDGE_S = 0.3
+# Where samples are slow a bridge must still be smooth to them.
 _MIN_BRIDGE_SAMPLES = 64
 # In it a light mode rings down.
 _REST_S = 1.0
+# Power is then known to 10 %.
 _SMOOTHING_BINS = 101
 
 

@@ -33,6 +33,7 @@ _EDGE_GUARD = 8
 # In this time a moving end is faded; the shape keeps its content within 4 / time, to 1e-6.
 _FADE_S = 0.5
 _FADE_SHAPE = 12.0
+# Of Gaussian noise, one sample of five hundred million.
 _SPIKE_SIGMAS = 6.0
 # A smooth peak dwells 1/(√2 - 1) times as long in its last step as in the one before; one that
 # is clipped holds there all that would lie beyond.

@@ -20,9 +20,11 @@ from omsm_ros.least_squares import least_squares
 
 # Guess of the slowest pole, in units of the rate at which the motion has its content.
 _GUESSED_RATE = 3.0
+# From the positive real axis [rad]: a damping of 0.42.
 _GUESSED_ANGLE = 2.0
 # Of the whole lag, the part first given to a delay where there are poles too.
 _KEPT_DELAY = 0.3
+# Sanathanan and Koerner (1963): it has converged, or will not.
 _LINEAR_ITERATIONS = 8
 # An added pole begins fast enough not to be seen, and slow enough to have a gradient.
 _ADDED_POLE = -10.0

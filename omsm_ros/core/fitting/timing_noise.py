@@ -13,6 +13,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Standard deviations beyond which an excess, or a correlation, is no chance.
 _CLEARLY = 5.0
+# Their variance is known to 10 %.
 _LEAST_STILL = 200
 # Of the greatest rate squared: slower is at rest.
 _STILL = 1e-4

@@ -17,6 +17,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Of half a turn, five degrees each: the other half is the same.
 _SECTORS = 36
+# Any, but one: the same points have the same figures.
 _NOISE_SEED = 22
 
 

@@ -14,6 +14,8 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
 
+# Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a
+# turned part has all around, to order 12.
 _POWER = (Term(0, 0), Term(1, -1), Term(1, 1), Term(2, 0))
 _FORM = terms_up_to(4)
 _SYMMETRIC = tuple(Term(n, 0) for n in range(4, 14, 2))

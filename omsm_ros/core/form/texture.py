@@ -12,11 +12,13 @@ from omsm_ros.core.form.figures import Figure
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 
+# Any, but one: the same points have the same figures.
 _NOISE_SEED = 21
 # An S-filter below this many cells would pass what cells fold; beyond it half a sine passes.
 _LEAST_CELLS = 3.0
 # Ends of the bands, as shares of the longest side: form, waviness, and what is finer.
 _BANDS = {"form": (np.inf, 1 / 4), "waviness": (1 / 4, 1 / 20), "finer": (1 / 20, 0.0)}
+# What is longer is form, by the bands above.
 _DEFAULT_L = 1 / 4
 
 

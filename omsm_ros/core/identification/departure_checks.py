@@ -35,6 +35,7 @@ from omsm_ros.readable import chance, plain, quantity
 _WORST_AGREEMENT = 2.5
 # Resolves 1 Hz.
 _AGREEMENT_SEGMENT_S = 1.0
+# A response that is the mean of fewer is known to a third at best.
 _LEAST_SEGMENTS = 8
 # Share of its size that a departure costs on a scan, as a standard uncertainty: backlash and
 # friction lag by their whole half width, a sine by its rms.

@@ -15,6 +15,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Resolves 1 Hz; a step test has a few edges in each segment.
 _SEGMENT_S = 1.0
+# Eight lines; fewer show no response.
 _LEAST_SEGMENT = 16
 
 

@@ -16,6 +16,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 _GREATEST_GAIN_BEYOND = 5.0
 # Band of the encoder's spectrum, in parts of the sampling rate, from which to extrapolate.
 _TOP_BAND = (0.35, 0.5)
+# Of rest beside an edge: it begins and ends at nothing, so that its spectrum has no leakage.
 _MARGIN_SAMPLES = 20
 
 

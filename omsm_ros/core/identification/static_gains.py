@@ -18,6 +18,7 @@ from omsm_ros.least_squares import unit_columns
 
 # Rest after an edge that is not averaged, for the response to settle.
 _SETTLE_S = 0.1
+# Gain, drift and offset are three unknowns.
 _LEAST_PLATEAUS = 4
 
 

@@ -15,6 +15,7 @@ from omsm_ros.quantities import MASS
 
 # The setting without which masses, springs and dampers are known only per mass of the table.
 TABLE_MASS_SETTING = "table_mass_kg"
+# Evenly over the band; a covariance of seven coefficients has no more directions than that.
 _LINES = 40
 # Root of χ² per degree of freedom, of which there are one or two: beyond this, which chance
 # exceeds three times in a thousand at most, it is another machine.

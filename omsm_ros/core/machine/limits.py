@@ -15,7 +15,7 @@ import numpy as np
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import Quantity
 from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
@@ -25,8 +25,8 @@ FASTEST = 100.0
 
 # A hundredth of a per cent, of the speed or of what it is allowed.
 _PRECISION = 1e-4
+# Of what is allowed: a path that does not move has no logarithm.
 _TINY = 1e-12
-_SAME_PERIOD = 1e-9
 # What the samples hold above it is the encoder's noise rather than the path.
 _CONTENT_SHARE = 0.999
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
@@ -119,7 +119,7 @@ class PathStart:
 
 
 def _continues(last: AxisBlock, block: AxisBlock) -> bool:
-    same_period = abs(block.sample_period / last.sample_period - 1) < _SAME_PERIOD
+    same_period = abs(block.sample_period / last.sample_period - 1) < SAME_PERIOD
     return same_period and block.first_sample == last.first_sample + len(last)
 
 

@@ -23,6 +23,7 @@ from omsm_ros.errors import IdentificationError
 # The engine's durations (fading, bridging, settling) are those of a machine read every
 # millisecond. Time is scaled so that this record is one, and scaled back in the result.
 _NOMINAL_PERIOD_S = 1e-3
+# Over three decades: 1.7 % apart.
 _FREQUENCIES = 400
 
 

@@ -34,6 +34,9 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 # No device here delivers more in one message; a longer block is a forgery or a wrong unit.
 MAX_BLOCK_SAMPLES = 4_000_000
 
+SAME_PERIOD = 1e-9
+"""Sample periods that differ by less than this part are one: a decimal number, rounded."""
+
 
 # What is not plausible was not measured: it counts as lost.
 _AXES = {"x": POSITION, "y": POSITION, "z": POSITION, "b": ANGLE, "c": ANGLE}

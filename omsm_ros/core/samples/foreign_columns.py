@@ -64,6 +64,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
 COUNT = "count"
 """The unit of a raw reading: a column in it says what one count is in SI."""
 
+# 0.4 MB of axes in a message.
 _BLOCK_SAMPLES = 10_000
 _NOT_RISING = (
     "import the parts before and after it one by one, or, if time is told too coarsely, leave it "

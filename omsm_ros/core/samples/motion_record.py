@@ -14,7 +14,14 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from omsm_ros.core.samples.accounts import Reason, StreamAccount
-from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import (
+    SAME_PERIOD,
+    AxisBlock,
+    Block,
+    BoolArray,
+    DistanceBlock,
+    FloatArray,
+)
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
@@ -23,7 +30,6 @@ from omsm_ros.quantities import SAMPLE_PERIOD
 
 # Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
 MAX_RECORD_SAMPLES = 20_000_000
-_SAME_PERIOD = 1e-9
 
 B = TypeVar("B", bound=Block)
 Values: TypeAlias = Callable[[Any], "tuple[FloatArray, BoolArray]"]
@@ -114,14 +120,14 @@ def assemble(
         )
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
-    if abs(probe_period / period - 1) < _SAME_PERIOD:
+    if abs(probe_period / period - 1) < SAME_PERIOD:
         return _by_counter(axes, distance, reference, period, trigger)
     return _by_stamp(axes, distance, reference)
 
 
 def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]) -> float:
     periods = sorted({float(block.sample_period) for block in blocks})
-    if periods[-1] > periods[0] * (1 + _SAME_PERIOD):
+    if periods[-1] > periods[0] * (1 + SAME_PERIOD):
         raise DataError(
             f"{name} blocks of different sample periods {periods!r} s; identify them apart"
         )
@@ -259,7 +265,7 @@ def _by_stamp(
 ) -> MotionRecord:
     """Join by counter, once the axis is where a trigger of the grid would have latched it."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
-    finer = max(int(np.ceil(probe_period / axis_period - _SAME_PERIOD)), 1)
+    finer = max(int(np.ceil(probe_period / axis_period - SAME_PERIOD)), 1)
     grid = [_refined(block, finer) for block in _ordered(distance)]
     moved = axes_at_probe(_ordered(axes), grid)
     second = []

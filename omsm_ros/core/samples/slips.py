@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.scatter import SIGMA_OF_MAD
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
@@ -41,7 +42,6 @@ _WANDER_S = 30.0
 _MOST_STAMPS = 1024
 # Scatter (standard deviation) of single stamps that the median of several never reaches.
 _SEVERAL_TIMES = 3.0
-_NORMAL_PER_MAD = 1.4826
 # A driver's clock is the end of a line, which moves more than a mean does. In 20 to 30 starts with
 # arrivals uneven by ±20 ms: 0.5 gives 2 false alarms, 0.7 none; 1.0 finds small slips late.
 _END_OF_LINE = 0.7
@@ -266,4 +266,4 @@ def _median(values: FloatArray) -> float:
 
 def _spread(values: FloatArray) -> float:
     """Return the standard deviation of normal values, little moved by others among them."""
-    return _NORMAL_PER_MAD * _median(abs(values - _median(values)))
+    return SIGMA_OF_MAD * _median(abs(values - _median(values)))

@@ -14,6 +14,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 _GREATEST_DIFFERENCE = 5e-3
 # Standard uncertainties of the stamped period that must lie between it and the written one.
 _CLEARLY = 5.0
+# A line through fewer does not know how uncertain it is.
 _LEAST_BLOCKS = 5
 
 

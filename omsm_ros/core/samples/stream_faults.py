@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import SAME_PERIOD, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
@@ -19,7 +19,6 @@ from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
 _NAMED = 3
 # Stamps of two clocks scatter; a counter is off by one sample or by none.
 _SKEW_SAMPLES = 0.5
-_SAME_PERIOD = 1e-9
 
 
 class StreamWatch:
@@ -82,7 +81,7 @@ class StreamWatch:
             yield f"{name}: the counter began anew {self.restarts} times: the device was restarted"
         if self.repeated:
             yield f"{name}: {self.repeated} samples repeat trigger numbers that came before"
-        if max(self.periods) - min(self.periods) > _SAME_PERIOD * min(self.periods):
+        if max(self.periods) - min(self.periods) > SAME_PERIOD * min(self.periods):
             yield f"{name}: sample periods from {min(self.periods)} s to {max(self.periods)} s"
         if self.invalid == self.samples:
             yield f"{name}: not one of {self.samples} readings is valid"

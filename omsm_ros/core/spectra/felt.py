@@ -8,14 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AccelerationBlock, FloatArray
+from omsm_ros.core.samples.blocks import SAME_PERIOD, AccelerationBlock, FloatArray
 from omsm_ros.core.spectra.lines import find_lines
 from omsm_ros.core.spectra.scan_signal import ScanSignal
 from omsm_ros.errors import DataError
 
 AXES = ("x", "y", "z")
+# As few frequencies as a floor of noise can be told from.
 _LEAST_SAMPLES = 256
-_SAME_PERIOD = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,7 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
     Raises DataError for blocks of several periods, or too few samples.
     """
     periods = {block.sample_period for block in blocks}
-    if not periods or max(periods) - min(periods) > _SAME_PERIOD * max(periods):
+    if not periods or max(periods) - min(periods) > SAME_PERIOD * max(periods):
         raise DataError(
             f"acceleration with sample periods {sorted(periods)!r} s, expected one; record again"
         )

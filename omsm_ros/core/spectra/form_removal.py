@@ -30,7 +30,10 @@ HIGHEST_ORDER = 12
 LOWEST_ORDER = 2
 # On one circle two waves are its astigmatism, too.
 LOWEST_ON_CIRCLE = 3
+# In time a scan that turns may drift as a cubic; what bends more is looked for as a line.
 _DRIFT_DEGREE = 3
+# Even, for symmetric form is; as Zernike terms are written. The high ones only where they are worth
+# it, for the columns grow with the square.
 _DEGREES = range(2, 15, 2)
 _USUAL_DEGREE = 6
 # A higher degree has to take away this share of what is left, or it fits noise and lines; less
@@ -38,6 +41,7 @@ _USUAL_DEGREE = 6
 _WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
 # Even samples that determine the form; it is smooth, and the rest would only cost time.
 _MOST_FITTED = 100_000
+# Samples at a time: 150 columns of them are 20 MB.
 _CHUNK = 16_384
 # So many times what an order and a figure make together, one of them is no longer known.
 _AGAINST = 1.5

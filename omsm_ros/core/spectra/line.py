@@ -14,9 +14,12 @@ from omsm_ros.core.spectra.scan_signal import PATH, ScanSignal
 CLOSEST = 0.6
 """Closer than this, in resolutions, a line is another's side lobe; two cannot be fitted."""
 
+# From a quarter of a resolution off: two lines one resolution apart are then right to 1e-9 of one,
+# after three steps to 0.003, which leaves 0.4 % of their amplitude.
 _FITTING_STEPS = 4
 # Frequencies to either side of where a known texture is looked for.
 _MOST_TRIED = 200
+# Forty lines of three columns are 31 MB.
 _CHUNK = 32_768
 # Of its power that a line in another coordinate takes, from which on that one is tried.
 _LIKE = 0.25

@@ -35,16 +35,18 @@ from omsm_ros.core.spectra.scan_signal import PATH, TIME, TURN, ScanSignal
 
 # Noise alone shows such a line in one spectrum of 740.
 LEAST_SIGMA = 3.0
+# Of three columns each; a machine shows ten or twenty, and each further one costs a fit of all.
 MOST_LINES = 40
 # Of the strongest that is left: weaker ones may be its side lobes.
 _TAKEN_TOGETHER = 0.3
+# Resolutions from a strong line, within which a weaker peak may be its side lobe.
 _APART_BINS = 8
 # Samples from one place to the next at which the rings are looked at.
 _STRIDE = 50
-# A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
-# and more of its power than jitter and encoders do.
 # A line and its like in another coordinate, of which that one takes more of the power.
 _SHADOW, _SHADOW_BINS = 0.3, 30
+# A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
+# and more of its power than jitter and encoders do.
 _LOST_RATIO, _LOST_SHARE = 12.5, 0.05
 
 

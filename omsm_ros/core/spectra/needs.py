@@ -10,6 +10,7 @@ from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
 from omsm_ros.readable import quantity
 
 RATE = "an accelerometer, or a scan at another sampling rate, tells"
+# A line of fifty waves is one wave elsewhere at another pace; by less it may not have moved.
 _SAME_PACE = 0.02
 
 

@@ -9,9 +9,11 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Median of the power of noise over its mean: power of one frequency is exponentially distributed.
 _MEDIAN_OVER_MEAN = float(np.log(2))
+# Frequencies to either side: a median of 24 such powers is known to 30 %, of 800 to 5 %.
 _NARROWEST, _WIDEST = 12, 400
 # Half-width over frequency: noise that falls with its square changes fourfold within an octave.
 _RELATIVE_WIDTH = 0.25
+# Evenly over the logarithm: in a million frequencies, 3.5 % apart.
 _BANDS = 400
 
 

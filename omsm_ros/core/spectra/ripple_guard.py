@@ -47,6 +47,7 @@ from omsm_ros.readable import count, quantity
 
 # What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
 _LEAST_FELT, _MOST_FELT = 0.1, 30.0
+# In resolutions: as uncertain is the frequency of a line that is taken for an order.
 _OF_AN_ORDER = 0.25
 # So near, in resolutions, a line and an order are not fitted apart.
 _LEAKS_BINS = 1.5

@@ -13,6 +13,7 @@ from omsm_ros.errors import DataError
 
 TIME, PATH, RADIUS, TURN = "time", "path", "radius", "turn"
 
+# As few frequencies as a floor of noise can be told from.
 _LEAST_POINTS = 256
 # Below a hundredth of a turn the spindle is at rest but for its encoder's noise.
 _LEAST_TURN = 0.01

@@ -22,7 +22,8 @@ _MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
 # and in steps of the path. A single point that stood for 30° of a turn of 2000 points would bring
 # its noise into every figure.
 _LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
-_SECTORS = 12
+# Of a turn: as wide as the widest arc that may be missing.
+_SECTORS = round(2 * np.pi / _LARGEST_ARC)
 # The side of a grid; the number of its cells falls to a quarter as their size doubles where they
 # fill the surface, and to a half where they lie along single tracks.
 _MOST_CELLS, _FILLED = 512, 3.5

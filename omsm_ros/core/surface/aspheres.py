@@ -16,6 +16,7 @@ from omsm_ros.core.surface.slopes import Gradient
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, Quantity
 
+# Twelve even powers differ by no more than rounding (their products have a condition of 3e16).
 MOST_TERMS = 20
 
 

@@ -18,6 +18,7 @@ from omsm_ros.errors import DataError
 from omsm_ros.least_squares import least_squares
 from omsm_ros.readable import plain
 
+# Of a ring of a profile, each seen once at least: form of up to five waves around averages out.
 _SECTORS = 12
 # Three numbers each: 12 MB.
 _MOST_WEIGHED = 2**19

@@ -25,6 +25,7 @@ from omsm_ros.core.surface.zernike_terms import (
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import CONIC_CONSTANT, DISC_RADIUS, RADIUS, TERM_ORDER, TERM_SIZE
 
+# Up to order 27; a picture of them takes two seconds and 400 MB.
 MOST_ZERNIKES = 400
 
 

@@ -49,7 +49,9 @@ from omsm_ros.errors import DataError
 CHUNK = 16_384
 # Four points for each of these columns are the least.
 _MOST_SELECTED, _LEAST_POINTS = 40_000, 200
+# Both together took 12 to 36 on spheres and off-axis paraboloids that had form.
 _MOST_TURNS, _MOST_REFINED = 30, 30
+# Points without errors, for seven unknowns.
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose stands when its last step moved no point by more than this share of their spread.
 _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10

@@ -23,6 +23,7 @@ Norm: TypeAlias = Literal["peak", "rms"]
 Indexing: TypeAlias = Literal["noll", "fringe", "ansi"]
 
 
+# The set ends there by its definition.
 MOST_FRINGE = 37
 
 

@@ -28,6 +28,7 @@ SIGNIFICANCE = 1e-3
 _COMPARED_PART = 1 / 3
 # Directions of the response known this much worse than the best say nothing.
 _RANK_TOLERANCE = 1e-2
+# Below it a response is the static gain and nothing else.
 _LEAST_BAND_HZ = 0.1
 
 
