@@ -32,8 +32,8 @@ from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 ROBUST = (0.0025, 0.9975)
 # Smooth terms of these orders, the most for which there are forty points each.
 _ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
-# Two hundred for each of the 91 terms up to order 12. Drawn are extents, which two thousand points of
-# a smooth form show.
+# Two hundred for each of the 91 terms up to order 12. Drawn are extents, which two thousand points
+# of a smooth form show.
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws know a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7

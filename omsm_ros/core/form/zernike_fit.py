@@ -18,7 +18,7 @@ from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, zernike_values
 from omsm_ros.errors import DataError
 
-# Points at a time: 37 terms of them stay in a cache of 2.5 MB; all at once take three times as long.
+# Points at a time: 37 terms of them stay in a cache of 2.5 MB; all at once take thrice as long.
 CHUNK = 8192
 # Ten digits are left, more than any of them is worth.
 _WORST_CONDITION = 1e6
