@@ -13,11 +13,9 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.storage import strict_yaml
-from omsm_ros.storage.files import read_text, save_text
+from omsm_ros.storage.files import read_text
 from omsm_ros.storage.schemas import NUMBER, check_form, form
 from omsm_ros.twin.disturbances import Disturbances
 
@@ -38,11 +36,6 @@ def load_disturbances(path: Path | str) -> Disturbances:
     except ConfigurationError as err:
         raise FileError(f"{what}: {err}") from err
     return made
-
-
-def save_disturbances(path: Path | str, disturbances: Disturbances) -> None:
-    """Write ``DISTURBANCES.yaml`` with all that is switched on."""
-    save_text(path, yaml.safe_dump(_content_of(disturbances), sort_keys=False))
 
 
 def _schema_of(kind: Any) -> dict[str, Any]:
@@ -70,23 +63,6 @@ def _made(kind: Any, content: Any) -> Any:
     if typing.get_origin(kind) is tuple:
         return tuple(_made(typing.get_args(kind)[0], item) for item in content)
     return kind(content)
-
-
-def _content_of(record: Any) -> dict[str, Any]:
-    """Names and values of a record that are not as they are by default."""
-    content: dict[str, Any] = {}
-    for field in fields(record):
-        value = getattr(record, field.name)
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        if value == default:
-            continue
-        if is_dataclass(value):
-            content[field.name] = _content_of(value)
-        elif isinstance(value, tuple):
-            content[field.name] = [_content_of(item) for item in value]
-        else:
-            content[field.name] = value
-    return content
 
 
 def _names(kind: Any) -> Mapping[str, None]:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from written_disturbances import write_disturbances
 
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.jobs.demonstrate import Demonstration, response_errors, true_response
-from omsm_ros.storage.disturbance_file import save_disturbances
 from omsm_ros.twin.catalogue import CATALOGUE
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
@@ -24,7 +24,7 @@ def test_without_a_file_nothing_is_wrong_with_the_machine(tmp_path):
 
 def test_the_emulator_is_given_the_file_by_its_whole_path(tmp_path, monkeypatch):
     latency = CATALOGUE["latency"][2]
-    save_disturbances(tmp_path / "d.yaml", latency)
+    write_disturbances(tmp_path / "d.yaml", latency)
     monkeypatch.chdir(tmp_path)
     plan = Demonstration(tmp_path / "out", disturbance_file=(tmp_path / "d.yaml").relative_to("/"))
     assert Demonstration(tmp_path, disturbance_file=tmp_path / "d.yaml").disturbances == latency

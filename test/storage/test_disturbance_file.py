@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from written_disturbances import write_disturbances
 
 import omsm_ros
 from omsm_ros.errors import FileError
-from omsm_ros.storage.disturbance_file import load_disturbances, save_disturbances
+from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.twin.catalogue import CATALOGUE, together
 from omsm_ros.twin.disturbances import NOTHING
 
@@ -24,7 +25,7 @@ def _load(tmp_path, text):
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_what_is_written_is_read_again(tmp_path, name):
     for size in CATALOGUE[name]:
-        save_disturbances(tmp_path / "d.yaml", size)
+        write_disturbances(tmp_path / "d.yaml", size)
         assert load_disturbances(tmp_path / "d.yaml") == size
 
 
@@ -33,7 +34,7 @@ def test_many_at_once_are_read_again(tmp_path):
     many = NOTHING
     for name in names:
         many = together(many, CATALOGUE[name][1])
-    save_disturbances(tmp_path / "d.yaml", many)
+    write_disturbances(tmp_path / "d.yaml", many)
     assert load_disturbances(tmp_path / "d.yaml") == many
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from parsed_page import Page
 
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import identify
@@ -12,8 +13,6 @@ from omsm_ros.report.certificate.page import (
     certificate_figures_of,
     render,
 )
-
-from .certificates import Page
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parsed_page import Page
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError
@@ -22,7 +23,7 @@ from omsm_ros.report.certificate.page import (
 )
 from omsm_ros.report.common import style
 
-from .certificates import ATTACK, Page, bare, by_name, certified, range_detail
+from .certificates import ATTACK, bare, by_name, certified, range_detail
 
 
 class TestPage:
