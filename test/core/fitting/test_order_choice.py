@@ -22,6 +22,7 @@ from omsm_ros.core.fitting.order_choice import (
 from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.starting_points import StartingPoints
 from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.errors import IdentificationError
 from omsm_ros.twin.plant import Plant, respond
 
 NOISE = 1e-8
@@ -70,6 +71,22 @@ def test_there_are_always_fewer_zeros_than_poles():
     assert structures(0) == [Structure(0, 0, True)]
 
 
+def test_a_structure_has_one_or_two_zeros_fewer_and_a_delay_or_none_the_smallest_first():
+    for poles in range(2, 7):
+        tried = structures(poles)
+        assert {(s.zeros, s.delay) for s in tried} == {
+            (zeros, delay) for zeros in (poles - 2, poles - 1) for delay in (False, True)
+        }
+        assert len(tried) == 4
+        assert [s.size for s in tried] == sorted(s.size for s in tried)
+
+
+@pytest.mark.parametrize("order", [-1, 21, 1000])
+def test_an_order_that_no_polynomial_has_digits_for_is_refused(order):
+    with pytest.raises(IdentificationError, match=r"expected 0 \(choose\) to 20"):
+        explore(fitter(problem_of(FIRST_ORDER)), order)
+
+
 def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
     """Of normal residuals with their own variance, but for a constant of n."""
     small, *_, large = (c.fit for c in explored(PAIR))
@@ -109,6 +126,15 @@ def test_a_pole_is_told_by_samples_it_shows_in(frequency, damping, told):
 def test_the_data_insist_on_as_many_poles_as_there_are(truth, poles):
     smallest = best(explored(truth)).fit
     assert smallest.structure.poles == poles
+    assert distance(smallest.dynamics, truth) < 0.01
+
+
+@pytest.mark.parametrize("zeros", [[1.0, 2e-3], [1.0, 4e-4, (2 * np.pi * 90.0) ** -2]])
+def test_the_data_insist_on_zeros_and_delay_too(zeros):
+    """The largest structure of three poles, and the one that is tried last below it."""
+    truth = TransferFunction(zeros, PAIR_AND_POLE.denominator, delay=1.7e-3)
+    smallest = best(explored(truth)).fit
+    assert smallest.structure == Structure(3, len(zeros) - 1, True)
     assert distance(smallest.dynamics, truth) < 0.01
 
 
