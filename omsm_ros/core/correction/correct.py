@@ -37,7 +37,14 @@ from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.pitch_curve import PitchCurve
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import AxisBlock, Block, BoolArray, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import (
+    SAME_PERIOD,
+    AxisBlock,
+    Block,
+    BoolArray,
+    DistanceBlock,
+    FloatArray,
+)
 from omsm_ros.core.samples.continuity import Arrival
 from omsm_ros.core.samples.merging import joined
 from omsm_ros.core.samples.pairing import Intake, Pairing, Run
@@ -46,9 +53,6 @@ from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
-
-# A period is written, not measured: it differs by rounding alone.
-SAME_PERIOD = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,8 +34,8 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 # No device here delivers more in one message; a longer block is a forgery or a wrong unit.
 MAX_BLOCK_SAMPLES = 4_000_000
 
-SAME_PERIOD = 1e-9
-"""Sample periods that differ by less than this part are one: a decimal number, rounded."""
+SAME_PERIOD = 1e-6
+"""Sample periods are written, not measured: alike to this part, six digits, they are one."""
 
 
 # What is not plausible was not measured: it counts as lost.
