@@ -43,8 +43,13 @@ _GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
 _MOST_CYCLES = 100
 # A period half a cycle off leaves as much as it takes, and would call for a second one.
 _BETWEEN_CYCLES = 37
-# Of Legendre polynomials: from a bend to four periods over the record, where lines begin.
-_DRIFT_DEGREES = (2, 3, 4, 6, 8, 12, 16)
+# The best of periods between independent ones is the best of so many times as many (Davies 1987).
+_OVERLAP = 3.0
+# Of Legendre polynomials: from a bend to two periods over the record, where lines begin. More of
+# them would follow a staircase, and hide a relaxation in it.
+_DRIFT_DEGREES = (2, 3, 4, 6, 8)
+# Of a line over the record: a drift has fewer.
+_FEWEST_PERIODS = 2
 # Of vibration at a time: the next round looks for more.
 _LINES_TRIED = 3
 
@@ -91,11 +96,15 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Departures:
-    """All families for the fit ``fitted`` of ``problem``."""
+    """All families for the fit ``fitted`` of ``problem``.
+
+    slower: than the record, by so much may a relaxation be
+    """
 
     problem: Problem
     fitted: Fit
     steps: Steps
+    slower: float = 1.0
 
     def families(self, only: Collection[str] = ()) -> Iterator[Family]:
         """Return the families that this motion could show at all, or those named of them."""
@@ -139,8 +148,8 @@ class Departures:
         return self.problem.moved(self.fitted)
 
     def time_constants(self) -> FloatArray:
-        """Return the time constants [s] that are looked for, up to the record's length."""
-        slowest = max(self.duration, 2 * FASTEST_CREEP_S)
+        """Return the time constants [s] that are looked for, up to ``slower`` records."""
+        slowest = max(self.slower * self.duration, 2 * FASTEST_CREEP_S)
         decades = np.log10(slowest / FASTEST_CREEP_S)
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
 
@@ -182,7 +191,7 @@ class Departures:
         length = 4 * fft.next_fast_len(samples, real=True)
         power = np.abs(fft.rfft(left, length)) ** 2
         # The slowest lines are drift.
-        power[: 4 * 4] = 0.0
+        power[: 4 * _FEWEST_PERIODS] = 0.0
         time = np.arange(samples) * self.problem.period
         found = []
         for _ in range(_LINES_TRIED):
@@ -229,7 +238,7 @@ class Departures:
         answer = self._in_time(self._answer) / self.fitted.gain
         travel = float(np.ptp(answer)) or 1.0
         cycles = np.arange(3, _MOST_CYCLES, dtype=np.float64)
-        trials = float(len(cycles))
+        trials = _OVERLAP * len(cycles)
         if near is not None:
             cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
         angles = 2 * np.pi * answer[:, np.newaxis] / travel * cycles

@@ -45,12 +45,16 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """The scores for ``fitted`` of all families, or of those named; each is computed once."""
+    """The scores for ``fitted`` of all families, or of those named; each is computed once.
+
+    slower: see :class:`Departures`
+    """
 
     problem: Problem
     fitted: Fit
     steps: Steps
     only: Collection[str] = ()
+    slower: float = 1.0
 
     @cached_property
     def space(self) -> ResidualSpace:
@@ -60,7 +64,7 @@ class Survey:
     @cached_property
     def departures(self) -> Departures:
         """The columns of all families."""
-        return Departures(self.problem, self.fitted, self.steps)
+        return Departures(self.problem, self.fitted, self.steps, self.slower)
 
     @cached_property
     def best(self) -> Mapping[str, Judged]:

@@ -125,7 +125,10 @@ def trusted_range(valid_up_to: float, limits: ResponseLimits) -> Finding:
         "valid_up_to_least_hz": _LEAST_TRUSTED_HZ,
     }
     reasons: tuple[str, ...] = ()
-    if valid_up_to < _LEAST_TRUSTED_HZ:
+    if valid_up_to == 0:
+        # More of the same steps do not close what a drift or a relaxation leaves open.
+        reasons = ("the response is known within limits at no frequency",)
+    elif valid_up_to < _LEAST_TRUSTED_HZ:
         reasons = (
             f"the response is known within limits only up to {quantity(valid_up_to, 'Hz', 2)}; "
             "make more or larger steps",
@@ -148,14 +151,15 @@ def requested_order(order: int, factor: float) -> Finding:
 def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float) -> Finding:
     """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known.
 
-    One that is ten times faster than half the sampling rate shapes nothing, and is not named.
+    One that is ten times faster than half the sampling rate shapes nothing, and is not named;
+    nor is any where nothing is known.
     """
     return Finding(
         warnings=tuple(
             f"pole at {quantity(mode.frequency, 'Hz')} lies beyond {quantity(valid_up_to, 'Hz')}, "
             "up to which the response is known within limits: it need not be a resonance"
             for mode in dynamics.modes()
-            if valid_up_to < mode.frequency < 10 * nyquist
+            if 0 < valid_up_to < mode.frequency < 10 * nyquist
         )
     )
 

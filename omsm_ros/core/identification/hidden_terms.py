@@ -48,6 +48,10 @@ _DECADES = 3.0
 _UNSEEN = _DECADES / 3**0.5
 
 
+# What drifts may be a relaxation of which the record shows the beginning.
+_SLOWER_THAN_RECORD = 2.0
+
+
 @dataclass(frozen=True, eq=False)
 class HiddenTerm:
     """One family that could hide.
@@ -81,9 +85,17 @@ class HiddenTerm:
         return np.asarray(rows.T @ rows)
 
 
-def hidden_terms(survey: Survey) -> list[HiddenTerm]:
-    """Return what could hide: the worst relaxation first, then the families that bend G."""
+def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm]:
+    """Return what could hide: the worst relaxation first, then the families that bend G.
+
+    drift: columns of the background that model a drift
+    """
+    if drift:
+        survey = replace(survey, slower=_SLOWER_THAN_RECORD)
     relaxations = [_hidden(survey, judged) for judged in survey.creep]
+    if drift:
+        other = without_drift(survey, drift).creep
+        relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
     told = [term for term in relaxations if np.isfinite(term.uncertainty)]
     found = [_worst(told, relaxation_found(survey.fitted.dynamics))] if told else []
     for name in _BENDING:
@@ -91,6 +103,34 @@ def hidden_terms(survey: Survey) -> list[HiddenTerm]:
         if judged is not None and np.isfinite(judged.score.uncertainty) and _told(survey, judged):
             found.append(_hidden(survey, judged))
     return found
+
+
+def without_drift(survey: Survey, drift: Sequence[slice]) -> Survey:
+    """Return ``survey`` with the drift that was modelled taken for noise of the readings.
+
+    Columns of any size let a drift of a micrometre undo a relaxation of as much. One that
+    wanders by nanometres cannot, and as noise it is no larger than it was found to be.
+    """
+    fitted, problem = survey.fitted, survey.problem
+    gone = np.zeros(problem.background.shape[1], np.bool_)
+    for columns in drift:
+        gone[columns] = True
+    drifted = problem.background[:, gone] @ fitted.background[gone]
+    noisy = fitted.residual + drifted[problem.used]
+    return Survey(
+        replace(problem, background=problem.background[:, ~gone]),
+        replace(fitted, background=fitted.background[~gone], residual=noisy),
+        survey.steps,
+        slower=survey.slower,
+    )
+
+
+def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
+    """The relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
+    size, uncertainty = float(other.score.size[0]), other.score.uncertainty
+    if not np.hypot(size, uncertainty) < term.carried:
+        return term
+    return replace(term, size=size, uncertainty=uncertainty, missed=_missed(other))
 
 
 def _worst(relaxations: list[HiddenTerm], found: float) -> HiddenTerm:
@@ -131,19 +171,22 @@ def _told(survey: Survey, judged: Judged) -> bool:
 
 
 def hidden_covariance(
-    survey: Survey, settings: Mapping[str, object], limits: ResponseLimits
+    survey: Survey,
+    settings: Mapping[str, object],
+    limits: ResponseLimits,
+    drift: Sequence[slice] = (),
 ) -> list[CovarianceTerm]:
     """Return the terms of the covariance, each with its entry for the certificate.
 
     limits: of the 95 % band, within which a response is trusted
-
+    drift: columns of the background that model a drift
     settings: with "priors", an object of standard uncertainties by the name of a family, a
         term is taken no larger than its prior
 
     Raises ConfigurationError for a prior that is no positive number.
     """
     priors = _priors(settings)
-    terms = hidden_terms(survey)
+    terms = hidden_terms(survey, drift)
     entries = [_entry(term, priors) for term in terms]
     covariance = [term.covariance(_carried(term, priors)) for term in terms]
     open_gain = max((_carried(t, priors) * t.above for t in terms), default=0.0)
@@ -259,18 +302,24 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
     imitated = _relative(fitted, frequency, shift)
     left = imitated - _departure(term.family, term.parameter, term.damping, frequency)
     above = float(np.max(np.abs(left))) if term.family == CREEP else 0.0
-    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, max(score.degrees, 1)))
     return HiddenTerm(
         term.family,
         term.parameter,
         float(score.size[0]),
         score.uncertainty,
-        float(limit + _POWER) * score.uncertainty,
+        _missed(judged),
         np.zeros_like(shift) if term.family == CREEP else shift,
         np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))]),
         above,
         float(np.sqrt(np.sum((np.abs(left) * rms) ** 2))),
     )
+
+
+def _missed(judged: Judged) -> float:
+    """Largest size that the test would have missed with 5 % probability."""
+    degrees = max(judged.score.degrees, 1)
+    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, degrees))
+    return float(limit + _POWER) * judged.score.uncertainty
 
 
 def _departure(family: str, parameter: float, damping: float, frequency: FloatArray) -> FloatArray:

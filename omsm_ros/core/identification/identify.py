@@ -22,6 +22,7 @@ from typing import ParamSpec
 
 import numpy as np
 
+from omsm_ros.core.departures.families import DRIFT
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.fitting.output_error import Fit
@@ -105,7 +106,8 @@ def identify(
     )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
-    hidden = hidden_covariance(searched.survey, settings or {}, limits)
+    drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]
+    hidden = hidden_covariance(searched.survey, settings or {}, limits, drift)
     hidden += [consistency(searched.survey)]
     hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
     known = response_uncertainty(prepared, model, limits, hidden)
