@@ -283,7 +283,9 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as err:
-        raise ConfigurationError("scheduler needs Dask: pip install distributed") from err
+        raise ConfigurationError(
+            "--scheduler needs Dask: pip install 'omsm_ros[campaign]'"
+        ) from err
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TypeError) as err:

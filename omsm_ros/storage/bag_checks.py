@@ -58,7 +58,10 @@ def check_files(path: Path) -> None:
             open_regular(part, BagError, "bag").close()
     metadata = path / "metadata.yaml"
     if metadata.is_file() and metadata.stat().st_size > _MAX_METADATA_BYTES:
-        raise BagError(f"bag {str(path)!r} has metadata of more than {_MAX_METADATA_BYTES} bytes")
+        raise BagError(
+            f"bag {str(path)!r} has metadata of more than {_MAX_METADATA_BYTES} "
+            "bytes; record it again, in fewer files"
+        )
 
 
 def check_index(path: Path, reader: Reader) -> None:

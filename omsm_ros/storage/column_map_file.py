@@ -96,7 +96,9 @@ def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
     unit = given.get("unit")
     if unit == COUNT:
         if COUNT not in given:
-            raise DataError(f"{channel}: what is one count in SI? write count: 1e-9, say")
+            raise DataError(
+                f"{channel}: what is one count in SI? write it into the map, as count: 1e-9"
+            )
         value = float(given[COUNT])
         if not 1e-15 <= abs(value) <= 1.0:
             raise DataError(

@@ -142,7 +142,8 @@ def probe_settings(message: Any) -> dict[str, object]:
 def _json_object(name: str, text: str) -> dict[str, object]:
     if len(text) > MAX_JSON_CHARACTERS:
         raise CalibrationError(
-            f"{name} of {len(text)} characters, at most {MAX_JSON_CHARACTERS} are accepted"
+            f"{name} of {len(text)} characters, at most {MAX_JSON_CHARACTERS} are accepted; "
+            "shorten it"
         )
     return strict_json.object_of(text or "{}", CalibrationError, name)
 

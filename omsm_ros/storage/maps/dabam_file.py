@@ -73,7 +73,9 @@ def load_dabam(path: Path) -> DabamProfile:
         lines = stream.read(_MAX_DATA_BYTES).decode("utf-8", "replace").splitlines()[skip:]
     table = rows_in(lines, what, "check FILE_HEADER_LINES", usecols=(0, 1))
     if not len(table):
-        raise FileError(f"{what} has no points after its {skip} lines of header")
+        raise FileError(
+            f"{what} has no points after its {skip} lines of header; check FILE_HEADER_LINES"
+        )
     position, value = (table[:, i] * float(numbers[i]) for i in (0, 1))
     return DabamProfile(position, value, form in _SLOPES, header)
 

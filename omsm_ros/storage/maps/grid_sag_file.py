@@ -96,7 +96,10 @@ def write_grid_sag(path: Path, grid: HeightGrid) -> None:
     """
     rows, columns = grid.height.shape
     if min(rows, columns) < 5:
-        raise FileError(f"a grid sag file has 5 × 5 points or more, this map {columns} × {rows}")
+        raise FileError(
+            f"a grid sag file has 5 × 5 points or more, this map {columns} × {rows}; "
+            "give a smaller --spacing"
+        )
     slope_x, slope_y, twist = _derivatives(grid)
     missing = ~np.isfinite(grid.height)
     parts = [np.where(missing, 0.0, grid.height), slope_x, slope_y, twist, missing]
