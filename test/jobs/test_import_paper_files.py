@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.jobs.write_recording import write_recording
 from omsm_ros.storage import calibration_file, cloud_file
+from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
 MAP = """
@@ -76,6 +79,36 @@ def test_a_scan_as_csv_gives_the_cloud_of_its_bag(tmp_path, small_scan, true_cal
 
 
 @pytest.mark.soak
+def test_axes_at_half_the_rate_join_the_probe_by_their_stamps(tmp_path, small_scan):
+    """Two loggers with rates of their own: the cloud is that of one, but for a spline's share."""
+    time = np.arange(len(small_scan.axes)) * 1e-3
+    axes, gap = small_scan.axes, small_scan.distance.distance
+    rows = np.column_stack([time, axes.x * 1e3, axes.z * 1e3, np.degrees(axes.c)])[::2]
+    np.savetxt(tmp_path / "z.csv", rows, "%.12g", ",", header="t,X,Z,C", comments="")
+    rows = np.column_stack([time, gap * 1e6])[301:]
+    np.savetxt(tmp_path / "d.csv", rows, "%.12g", ",", header="t,d", comments="")
+    (tmp_path / "map.yaml").write_text(
+        "columns:\n  time: {name: t, unit: s}\n  x: {name: X, unit: mm}\n"
+        "  z: {name: Z, unit: mm}\n  c: {name: C, unit: deg}\n  y: {constant: 0}\n"
+        "  b: {constant: 0}\n  distance: {name: d, unit: um}\n"
+    )
+    files = (tmp_path / "z.csv", tmp_path / "d.csv")
+    run("import", *files, "--map", tmp_path / "map.yaml", "--out", tmp_path / "own.mcap")
+    write_recording(tmp_path / "one.mcap", small_scan)
+    identified = identify(assemble(*zip(*blocks_of(step_test_of(Scenario())), strict=True), ()))
+    calibration_file.save_calibration(tmp_path / "cal.json", identified.calibration)
+    options = ("--calibration", tmp_path / "cal.json", "--no-report")
+    run("correct", tmp_path / "own.mcap", "--out", tmp_path / "own", "--by-stamps", *options)
+    run("correct", tmp_path / "one.mcap", "--out", tmp_path / "one", *options)
+    own, one = (cloud_file.CloudFile(tmp_path / n / "cloud.ply").read() for n in ("own", "one"))
+    place = np.searchsorted(one["sample"], own["sample"] + 301)
+    inside = place < len(one)
+    difference = own["height"][inside] - one["height"][place[inside]]
+    assert len(difference) > 0.98 * len(one)
+    assert np.std(difference) < 1e-9
+
+
+@pytest.mark.soak
 def test_the_paper_s_step_test_and_scan_as_csv(tmp_path):
     """254 000 points, 30 rpm, and the calibration of 20 steps."""
     steps, scan = step_test_of(Scenario()), scan_of(Scenario())
@@ -122,6 +155,8 @@ def test_ten_million_rows_in_the_memory_of_few(tmp_path):
 PEAK = """
 import resource, sys
 from omsm_ros import cli
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.samples.motion_record import assemble
 assert cli.main(sys.argv[1:]) == 0
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
