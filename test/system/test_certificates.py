@@ -30,7 +30,7 @@ def test_a_certificate_is_filed_of_every_identification(cell):
     page = folder / "certificate.html"
     for rise, success, word in ((0.0, False, "✕ Rejected"), (20e-3, True, "✓ Accepted")):
         bag = _bag(cell.folder / f"rise_{rise}.mcap", rise)
-        reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=20.0)
+        reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=6.0)
         assert reply.success == success, reply.message
         assert str(page) in reply.message
         assert word in page.read_text(encoding="utf-8")
@@ -47,7 +47,7 @@ def test_neither_a_certificate_nor_a_database_that_fails_undoes_the_calibration(
     output, taken = cell.folder / "cal.json", str(cell.folder / "taken")
     cell.processes.start("calibrator", output=str(output), report=taken, catalogue=taken)
     bag = _bag(cell.folder / "steps.mcap", 20e-3)
-    reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=20.0)
+    reply = cell.call(Identify, "calibrator/identify", bag=bag, order=2, duration=6.0)
     assert reply.success
     assert "no certificate" in reply.message
     assert "not written into the catalogue" in reply.message
