@@ -83,7 +83,10 @@ def register(
             f"{len(first.x)} points lie on the nominal surface, expected {_LEAST_POINTS} or more; "
             "check its parameters, the aperture and the units of the cloud"
         )
-    columns = freedom_columns(start, first, FREEDOMS)
+    # Seated first: from where the part was left, a turn of half a degree passes for one that shows.
+    seated = _coarse(surface, chosen, FREEDOMS[:3], aperture, start)
+    first = usable(placed(surface, seated, chosen), aperture)
+    columns = freedom_columns(seated, first, FREEDOMS)
     freedoms = determined(asked, columns @ columns.T, len(first.x))
     at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
     points = usable(placed(surface, at, chosen), aperture)
