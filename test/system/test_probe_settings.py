@@ -38,6 +38,7 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
         processes.end("confocal_driver")
         processes.start("recorder", path=str(path))
         driver(averaging)
+        cell.wait("the recorder", lambda: node.value("corrector", "points_subscribers") >= 1)
         return path
 
     processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
