@@ -227,7 +227,11 @@ def _departures(entries: tables.CertificateEntries) -> Section:
     return Section(
         "What departs, and what could hide",
         (),
-        (tables.departure_table(entries), tables.hidden_table(entries)),
+        (
+            tables.departure_table(entries),
+            tables.consistency_table(entries),
+            tables.hidden_table(entries),
+        ),
         "A size that would be missed is one that this very test shows with a probability of "
         "95 %; the band includes what the test cannot exclude.",
     )

@@ -29,7 +29,7 @@ _SHOWN = {
     "valid_from", "departures", "could_hide", "hidden_mostly", "plateau_s", "assumed",
     "motion_error_m", "reservations", "timing_scatter_s",
     "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
-    "reference_lag_uncertainty_s", "latency",
+    "reference_lag_uncertainty_s", "latency", "consistency",
 }  # fmt: skip
 
 CertificateEntries = Mapping[str, Any]
@@ -204,6 +204,28 @@ def departure_table(certificate: CertificateEntries) -> Table:
         together = quantity(certificate.get("motion_error_m"), "m")
         rows.append(("together, on a height", together, "", ""))
     return Table("Found beside a steady linear response", ("size", "u", "modelled"), rows)
+
+
+def consistency_table(certificate: CertificateEntries) -> Table:
+    """What differs between the parts of the test, the first less the second."""
+    rows = [
+        (
+            str(entry.get("parts", NOTHING)),
+            measured(entry.get("lag_difference_s"), entry.get("lag_difference_uncertainty_s"), "s"),
+            measured(
+                _ppm(entry.get("gain_difference")), _ppm(entry.get("gain_difference_uncertainty"))
+            ),
+            probability(entry.get("p")),
+        )
+        for entry in listed(certificate, "consistency")
+    ]
+    columns = ("lag differs by", "gain differs by [ppm]", "p, by chance")
+    return Table("Do the parts of the test agree?", columns, rows)
+
+
+def _ppm(value: object) -> float | None:
+    known = number(value)
+    return None if known is None else known / PPM
 
 
 def hidden_table(certificate: CertificateEntries) -> Table:
