@@ -25,7 +25,7 @@ MOVES = ("x", "y", "clocking")
 """Freedoms that a chuck settles; piston, tip and tilt no part comes without."""
 # Of its uncertainty: a part that is found so far off was moved. Less may be its form, the size of
 # which is itself found from few terms.
-_PLAINLY = 3.0
+_PLAINLY = 5.0
 _LEAST_FORM_M = NANOMETRE_M
 
 

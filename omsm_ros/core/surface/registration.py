@@ -83,12 +83,14 @@ def register(
             f"{len(first.x)} points lie on the nominal surface, expected {_LEAST_POINTS} or more; "
             "check its parameters, the aperture and the units of the cloud"
         )
-    # Seated first: from where the part was left, a turn of half a degree passes for one that shows.
-    seated = _coarse(surface, chosen, FREEDOMS[:3], aperture, start)
-    first = usable(placed(surface, seated, chosen), aperture)
-    columns = freedom_columns(seated, first, FREEDOMS)
-    freedoms = determined(asked, columns @ columns.T, len(first.x))
-    at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
+    freedoms = _determined(surface, chosen, asked, aperture, start)
+    try:
+        at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
+    except DataError:
+        # Where the part was left askew, a turn of half a degree may pass for one that shows.
+        seated = _coarse(surface, chosen, FREEDOMS[:3], aperture, start)
+        freedoms = _determined(surface, chosen, asked, aperture, seated)
+        at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
     points = usable(placed(surface, at, chosen), aperture)
     disc = aperture or about_the_origin(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
@@ -98,6 +100,19 @@ def register(
     if AUTO in asked:
         fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
     return _over_all(fit, stand, portions, sources, open_)
+
+
+def _determined(
+    surface: Surface,
+    chosen: Portion,
+    asked: Sequence[str],
+    aperture: Aperture | None,
+    at: Placement,
+) -> Freedoms:
+    """Return which freedoms the surface tells apart where the part is ``at``."""
+    points = usable(placed(surface, at, chosen), aperture)
+    columns = freedom_columns(at, points, FREEDOMS)
+    return determined(asked, columns @ columns.T, len(points.x))
 
 
 class _Stand(NamedTuple):
