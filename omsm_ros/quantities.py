@@ -173,6 +173,10 @@ SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
 MAP_POINTS = Quantity(
     "number of points", "", 1, 12_000_000, "write their true number, or thin them", whole=True
 )
+# Records whose number the length of their file proves; 24 bytes each while they are used.
+CLOUD_POINTS = Quantity(
+    "number of points", "", 1, 40_000_000, "write their true number, or thin them", whole=True
+)
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 
 # --------------------------------------------------------------------------- uncertainty

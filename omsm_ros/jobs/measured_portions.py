@@ -12,6 +12,7 @@ from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.core.surface.placement import Aperture, Portion, Portions
 from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
@@ -75,13 +76,20 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
         cloud = CloudFile(file)
     except FileError:
         points = read_points(file, units)
-        whole = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
-        return Measurement(lambda: [whole], (), False, points.notes, as_grid(points) is not None)
+        gridded = as_grid(points) is not None
+        return Measurement(lambda: _slices(points), (), False, points.notes, gridded)
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
     if fields is None:
         return Measurement(lambda: _portions(cloud, None), (), False)
     return Measurement(lambda: _portions(cloud, fields), fields.names, True, bounds=fields.bounds)
+
+
+def _slices(points: MeasuredPoints) -> Iterator[Portion]:
+    for first in range(0, len(points), _PORTION):
+        part = slice(first, first + _PORTION)
+        x, y, height = points.x[part], points.y[part], points.height[part]
+        yield Portion(x, y, height, np.empty((0, len(x))))
 
 
 def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[Portion]:

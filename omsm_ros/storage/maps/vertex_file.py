@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.quantities import MAP_POINTS, shown
+from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.storage.files import open_regular, said, whole_file
 from omsm_ros.storage.maps.length_units import LengthUnits, needed
 from omsm_ros.storage.table_file import rows_in
@@ -122,7 +122,7 @@ def _dtype(fields: list[tuple[str, str]], what: str) -> np.dtype[np.void]:
 def _count(text: Sequence[str], what: str) -> int:
     said = " ".join(text)
     count = int(said) if said.isascii() and said.isdecimal() and len(said) <= 12 else said
-    return int(MAP_POINTS.checked(count, FileError, f"{what}: number of points"))
+    return int(CLOUD_POINTS.checked(count, FileError, f"{what}: number of points"))
 
 
 def _records(
@@ -138,7 +138,8 @@ def _records(
             "short, write it again"
         )
     if not ascii_text:
-        return np.frombuffer(stream.read(least), dtype)
+        # Mapped: the columns are taken out of it one by one.
+        return np.memmap(stream, dtype, mode="r", offset=begin, shape=(count,))
     columns = rows_in(stream, what, "write a line a point", max_rows=count).T
     if columns.shape != (len(dtype), count):
         raise FileError(
@@ -153,24 +154,28 @@ def _points(
     names = table.dtype.names or ()
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
     scale = LengthUnits(1.0, 1.0) if ours else needed(units, what)
-    column = {name: _quiet(table[name]) for name in names if name != "sample"}
-    height = column.get("height", column.get("z"))
-    spread = column.get("uncertainty") if ours else None
+    height = "height" if "height" in names else "z"
+    spread = _quiet(table["uncertainty"]) if ours and "uncertainty" in names else None
     return measured(
-        column["x"] * scale.lateral,
-        column["y"] * scale.lateral,
-        np.asarray(height) * scale.height,
+        _quiet(table["x"], scale.lateral),
+        _quiet(table["y"], scale.lateral),
+        _quiet(table[height], scale.height),
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
         sample=table["sample"] if ours and "sample" in names else None,
     )
 
 
-def _quiet(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return floats (n,) without NaN of the signalling kind, which damaged bytes may be."""
+def _quiet(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
+    """Return ``scale`` times values (n,), without NaN of the signalling kind.
+
+    Damaged bytes may be such.
+    """
     with np.errstate(invalid="ignore"):
         found = values.astype(np.float64)
     found[np.isnan(found)] = np.nan
-    return found
+    if scale != 1.0:
+        found *= scale
+    return np.asarray(found)
 
 
 # ------------------------------------------------------------------------------- writing
