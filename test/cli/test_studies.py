@@ -88,17 +88,27 @@ def test_align_finds_the_spindle(capsys, tmp_path, calibration):
     assert machine_files.load_geometry(out).centre_x == found["geometry"]["centre_x"]
 
 
-@pytest.mark.parametrize("wrong", [0.0, -0.01])
-def test_align_warns_where_the_sphere_is_another(capsys, tmp_path, calibration, wrong):
-    """A radius that is 1 % off leaves far more than the 10 nm by which the points scatter."""
+def sphere_aligned(tmp_path, calibration, radius):
     part = Sphere(SPHERE_RADIUS_M)
     bag = write(tmp_path / "s.mcap", record(Cell(), Spiral(part, 4e-3, 8e-4, 30.0), part))
-    words = ("align", bag, "--calibration", calibration, "--radius", SPHERE_RADIUS_M * (1 + wrong))
-    assert cli.main([str(word) for word in (*words, "--out", tmp_path / "geometry.yaml")]) == 0
+    words = ("align", bag, "--calibration", calibration, "--radius", radius)
+    return cli.main([str(word) for word in (*words, "--out", tmp_path / "geometry.yaml")])
+
+
+def test_align_tells_the_noise_by_which_the_points_scatter(capsys, tmp_path, calibration):
+    assert sphere_aligned(tmp_path, calibration, SPHERE_RADIUS_M) == 0
     said = capsys.readouterr().out
-    assert ("warning" in said) is bool(wrong)
+    assert "warning" not in said
     noise = float(re.search(r"of which noise ([\d.]+) nm", said)[1])
     assert noise == pytest.approx(10.5, rel=0.15)
+
+
+def test_align_refuses_another_sphere_and_names_its_radius(capsys, tmp_path, calibration):
+    assert sphere_aligned(tmp_path, calibration, 0.99 * SPHERE_RADIUS_M) == 2
+    found = re.search(r"of radius ([\d.]+) mm ± ([\d.]+) mm", capsys.readouterr().err)
+    radius, uncertainty = float(found[1]), float(found[2])
+    assert abs(radius - SPHERE_RADIUS_M * 1e3) < 3 * uncertainty < 0.05
+    assert not (tmp_path / "geometry.yaml").exists()
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,8 @@ MAX_POLES = 20
 _LEAST_PARAMETERS = 3
 # Of the critical damping: a resonance beyond half the sampling rate shows in no sample.
 _DAMPED_BEYOND = 0.1
+# Radians a sample, some thirty times half the sampling rate: from there on it is a constant.
+_OUT_OF_SIGHT = 100.0
 # Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
 _CANCELLING = 0.005
 
@@ -137,7 +139,9 @@ def identifiable(dynamics: TransferFunction, period: float, duration: float) -> 
     poles = dynamics.poles()
     rate, decay = np.abs(poles), -poles.real
     lasting = decay * duration < 1
-    ringing = (rate * period > np.pi) & (decay < _DAMPED_BEYOND * rate)
+    turned = rate * period
+    beyond = (np.pi < turned) & (turned < _OUT_OF_SIGHT)
+    ringing = beyond & (decay < _DAMPED_BEYOND * rate)
     return not bool(np.any(lasting | ringing))
 
 

@@ -71,7 +71,8 @@ def test_plateaus_are_counted_between_edges():
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_coarse_readings_are_accepted_with_a_band_that_holds_the_truth(seed):
     found = identify(recorded(seed)).calibration
-    assert str(found.certificate["verdict"]).startswith("accepted,")
+    # Rounding is an error periodic in the travel, and may be found as one beside the response.
+    assert str(found.certificate["verdict"]).startswith("accepted")
     lines = np.array([1.0, 5.0, 15.0])
     off = np.abs(np.log(found.dynamics.response(lines)) + 2j * np.pi * lines * LAG_S)
     band = response_band(found.dynamics, found.covariance, lines)
