@@ -25,7 +25,7 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
-# Three processes, the nodes in one of them, which mostly waits (see test/conftest.py); JOBS=0 for
+# Three processes, the nodes in two of them, which mostly wait (see test/conftest.py); JOBS=0 for
 # one after the other.
 JOBS ?= 3
 test: lint

@@ -1,7 +1,7 @@
 """Recordings of the twin that several tests look at; made once, never changed.
 
 And who runs what when several processes share the tests: a file stays together, for its tests
-share recordings; all that start nodes stay together, for they share the machine's patience.
+share recordings; those that start nodes are two such parts, for they share the machine's patience.
 """
 
 import pytest
@@ -15,11 +15,12 @@ from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 SMALL = Scenario(start_radius=2e-3)
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist looks at the groups
 def pytest_collection_modifyitems(items):
+    with_nodes = sorted({item.path for item in items if item.path.parent.name == "system"})
+    half = {path: f"system {place % 2}" for place, path in enumerate(with_nodes)}
     for item in items:
-        folder = item.path.parent.name
-        group = folder if folder == "system" else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
+        item.add_marker(pytest.mark.xdist_group(half.get(item.path, str(item.path))))
 
 
 @pytest.fixture(scope="session")

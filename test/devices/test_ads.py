@@ -16,8 +16,6 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 pytest.importorskip("pyads", reason="pyads is an optional package")
 from pyads.testserver import AdsTestServer, AdvancedHandler, PLCVariable
 
-# The port of ADS is fixed: one server at a time.
-pytestmark = pytest.mark.xdist_group("ads")
 SAMPLES = 50
 ADDRESS = f"ads://127.0.0.1?samples={SAMPLES}"
 
