@@ -25,11 +25,10 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
-# Three processes, the nodes in two of them, which mostly wait (see test/conftest.py); JOBS=0 for
-# one after the other.
+# Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
 JOBS ?= 3
 test: lint
-	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadgroup
+	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	$(RUN) ruff check .

@@ -1,7 +1,6 @@
 """Recordings of the twin that several tests look at; made once, never changed.
 
-And who runs what when several processes share the tests: a file stays together, for its tests
-share recordings; those that start nodes are two such parts, for they share the machine's patience.
+And their order: several processes share the tests, a file each, and files with nodes mostly wait.
 """
 
 import pytest
@@ -15,12 +14,13 @@ from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 SMALL = Scenario(start_radius=2e-3)
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist looks at the groups
 def pytest_collection_modifyitems(items):
-    with_nodes = sorted({item.path for item in items if item.path.parent.name == "system"})
-    half = {path: f"system {place % 2}" for place, path in enumerate(with_nodes)}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(half.get(item.path, str(item.path))))
+    """Spread the files with nodes evenly among the others."""
+    place = {}
+    for with_nodes in (True, False):
+        files = sorted({i.path for i in items if (i.path.parent.name == "system") is with_nodes})
+        place |= {file: k / len(files) for k, file in enumerate(files)}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(scope="session")
