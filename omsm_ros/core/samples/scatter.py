@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
 
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.scipy_parts import sosfilt
 
 # Of the normal distribution, whose median absolute value is 0.6745 σ.
 SIGMA_OF_MAD = 1.4826
@@ -87,9 +87,10 @@ class RunningScatter:
     def _running(self, sizes: FloatArray) -> FloatArray:
         """Return the mean before any of ``sizes`` (n,) and after each of them, (n + 1,)."""
         sums = []
+        fading = np.array([[1.0, 0.0, 0.0, 1.0, -self._decay, 0.0]])
         for k, values in enumerate((sizes, np.ones(len(sizes)))):
-            state = np.array([self._decay * self._sums[k]])
-            after, _ = signal.lfilter([1.0], [1.0, -self._decay], values, zi=state)
+            state = np.array([[self._decay * self._sums[k], 0.0]])
+            after = sosfilt(fading, values, state)
             sums.append(np.concatenate([[self._sums[k]], after]))
             self._sums[k] = float(sums[k][-1])
         return np.asarray(sums[0] / np.maximum(sums[1], np.finfo(np.float64).tiny), np.float64)

@@ -18,6 +18,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.storage.files import open_regular, said
 from omsm_ros.storage.foreign.table import PIECE_ROWS, ForeignTable
+from omsm_ros.storage.hdf5_walk import walked
 
 # What is loaded whole: NumPy's and MATLAB's own files.
 _MAX_WHOLE_BYTES = 4_000_000_000
@@ -80,6 +81,7 @@ class ArrayTable(ForeignTable):
             import h5py
         except ImportError as err:
             raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
+        walked(self.path, str(self))
         found: dict[str, Any] = {}
         file = self._opened.enter_context(h5py.File(self.path, "r"))
 

@@ -15,6 +15,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, said, whole_file
+from omsm_ros.storage.hdf5_walk import walked
 from omsm_ros.storage.maps.length_units import metres_in
 from omsm_ros.storage.maps.optional import library
 
@@ -32,6 +33,7 @@ def read_hdf5(path: Path) -> MeasuredPoints:
     what = f"HDF5 file {str(path)!r}"
     h5py = library("h5py", what)
     with open_regular(path, FileError, "HDF5 file") as stream:
+        walked(path, what)
         try:
             with h5py.File(stream, "r") as content:
                 if content.attrs.get("schema") == SCHEMA:
