@@ -32,7 +32,14 @@ def best(added, family):
     return Survey(prepared.problem, late, prepared.steps, (family,)).best[family]
 
 
-@pytest.mark.parametrize("frequency", [2.033, 13.711, 120.04])
+@pytest.mark.parametrize(
+    "frequency",
+    [
+        13.711,
+        pytest.param(2.033, marks=pytest.mark.soak),
+        pytest.param(120.04, marks=pytest.mark.soak),
+    ],
+)
 def test_a_line_is_found_between_the_lines_of_the_record(frequency):
     """Within the bound of Cramér and Rao times four, far below the 0.1 Hz between lines."""
     size = 20e-9
@@ -43,7 +50,7 @@ def test_a_line_is_found_between_the_lines_of_the_record(frequency):
     assert np.linalg.norm(found.score.size) == pytest.approx(size, rel=0.05)
 
 
-@pytest.mark.parametrize("period", [2.413e-6, 7.03e-6])
+@pytest.mark.parametrize("period", [2.413e-6, pytest.param(7.03e-6, marks=pytest.mark.soak)])
 def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
     size = 20e-9
     searched = search(prepared_of(size * np.sin(2 * np.pi * LATE / period + 1.0)), model_from_start)
