@@ -12,7 +12,8 @@ from types import TracebackType
 
 from omsm_ros.errors import OmsmError
 
-_END_TIMEOUT_S = 15.0
+# A busy disk takes its time to take the last of a recording.
+_END_TIMEOUT_S = 30.0
 
 
 class NodeProcesses:
