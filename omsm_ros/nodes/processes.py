@@ -12,8 +12,7 @@ from types import TracebackType
 
 from omsm_ros.errors import OmsmError
 
-# A busy disk takes its time to take the last of a recording.
-_END_TIMEOUT_S = 30.0
+_END_TIMEOUT_S = 15.0
 
 
 class NodeProcesses:
