@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from late_steps import LAG, LATE, PERIOD, TIME, late_record
 
 from omsm_ros.core.departures.families import DRIFT, relaxed
 from omsm_ros.core.departures.survey import Survey
@@ -11,19 +12,6 @@ from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.hidden_terms import hidden_terms, without_drift
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
-
-PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
-STEPS = StepTest()
-TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
-Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
-
-
-def record_of(added, seed=1):
-    random = np.random.default_rng(seed)
-    seen = -(LATE + added) + random.normal(0, NOISE, len(TIME))
-    return MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
 
 
 def walk(size, seed=3):
@@ -32,7 +20,7 @@ def walk(size, seed=3):
 
 
 def test_drift_taken_for_noise_comes_back_into_the_residual():
-    searched = search(prepare(record_of(walk(15e-9)), "encoder"), model_from_start)
+    searched = search(prepare(late_record(-walk(15e-9)), "encoder"), model_from_start)
     drift = [b.columns for b in searched.beside if b.term.family == DRIFT]
     survey = searched.survey
     bare = without_drift(survey, drift)
@@ -49,7 +37,7 @@ def test_drift_taken_for_noise_comes_back_into_the_residual():
 
 def test_a_machine_that_wanders_a_little_is_calibrated():
     """6 nm in a second: the response is known, and what it is open by is said."""
-    calibration = identify(record_of(walk(6e-9))).calibration
+    calibration = identify(late_record(-walk(6e-9))).calibration
     assert str(calibration.certificate["verdict"]).startswith("accepted with reservations")
     at = np.array([1.0])
     off = abs(calibration.dynamics.response(at) * np.exp(2j * np.pi * at * LAG) - 1)
@@ -66,7 +54,7 @@ def test_the_band_holds_a_relaxation_that_only_begins_in_the_record(records):
     """It looks like a drift; of 0.1 % of the motion all is missing at 1 Hz."""
     size = 1e-3
     crept = size * (relaxed(LATE, PERIOD / (records * TIME[-1])) - LATE)
-    calibration = identify(record_of(crept)).calibration
+    calibration = identify(late_record(-crept)).calibration
     at = np.array([1.0])
     truth = (1 - size) * np.exp(-2j * np.pi * at * LAG)
     off = abs(calibration.dynamics.response(at) / truth - 1)[0]

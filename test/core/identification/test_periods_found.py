@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from late_steps import LATE, NOISE, STEPS, TIME, late_record
 
 from omsm_ros.core.departures.families import DRIFT, PERIODIC, VIBRATION
 from omsm_ros.core.departures.survey import Survey
@@ -10,20 +11,10 @@ from omsm_ros.core.fitting.output_error import fit
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
-
-PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
-STEPS = StepTest()
-TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
-Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
 
 
-def prepared_of(added, seed=1):
-    random = np.random.default_rng(seed)
-    seen = -LATE + added + random.normal(0, NOISE, len(TIME))
-    z = Z + random.normal(0, 0.3e-9, len(Z))
-    return prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder")
+def prepared_of(added):
+    return prepare(late_record(added), "encoder")
 
 
 def best(added, family):

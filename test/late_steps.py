@@ -1,0 +1,18 @@
+"""A step test whose probe is late and nothing else, for tests that add one thing to it."""
+
+import numpy as np
+
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
+
+PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
+STEPS = StepTest()
+TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
+Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
+
+
+def late_record(added, seed=1):
+    """With ``added`` (n,) [m] in the readings."""
+    random = np.random.default_rng(seed)
+    seen = -LATE + added + random.normal(0, NOISE, len(TIME))
+    return MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
