@@ -31,8 +31,8 @@ from omsm_ros.core.dynamics.latency import declared, with_latency
 from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.registration.placement import Portion
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.core.surface.placement import Portion
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 from omsm_ros.units import NANOMETRE_M

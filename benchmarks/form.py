@@ -25,11 +25,11 @@ from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.form.removal import without_second_order
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.registration.placement import Aperture, Portion
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
-from omsm_ros.core.surface.placement import Aperture, Portion
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.core.surface.zernike_terms import first_terms, zernike_values
 from omsm_ros.storage.cloud_file import PlyWriter

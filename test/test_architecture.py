@@ -39,9 +39,10 @@ ROOMS = {
     "identification": FITTING | {"fitting", "departures"},
     "sampled": FITTING | {"fitting", "departures", "identification"},
     "correction": FITTING,
-    "surface": FITTING | {"correction"},
+    "surface": FITTING,
+    "registration": FITTING | {"correction", "surface"},
     "comparison": FITTING | {"correction", "surface"},
-    "form": FITTING | {"correction", "surface"},
+    "form": FITTING | {"surface", "registration"},
     "spectra": FITTING,
     "verification": FITTING | {"fitting", "departures", "identification", "correction", "surface"},
 }
@@ -302,14 +303,14 @@ def test_a_broken_rule_is_told(rule, name, source, told):
 def test_a_room_that_looks_where_it_must_not_is_told(room, other):
     """The whole graph: the corridor from samples to identification, and who stands beside it."""
     order = ["samples", "dynamics", "machine", "fitting", "departures", "identification"]
-    beside = {"sampled": 6, "correction": 3, "surface": 3, "comparison": 3, "form": 3}
-    beside |= {"spectra": 3, "verification": 6}
+    beside = {"sampled": 6, "correction": 3, "surface": 3, "registration": 3, "comparison": 3}
+    beside |= {"form": 3, "spectra": 3, "verification": 6}
     allowed = set(order[: order.index(room) if room in order else beside[room]]) | {room}
     on_points = {"correction", "surface"}
     allowed |= {
-        "surface": {"correction"},
+        "registration": on_points,
         "comparison": on_points,
-        "form": on_points,
+        "form": {"surface", "registration"},
         "verification": on_points,
     }.get(room, set())
     tree = ast.parse(f"from omsm_ros.core.{other}.new import anything")

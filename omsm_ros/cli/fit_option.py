@@ -7,8 +7,8 @@ import argparse
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Facts
-from omsm_ros.core.surface.freedoms import parsed_freedoms
-from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.registration.freedoms import parsed_freedoms
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import count, expanded, figure, measured
 from omsm_ros.report.measurement.part import dragged, settled

@@ -11,7 +11,7 @@ from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, form_rows
 from omsm_ros.core.machine.limits import MachineLimits
-from omsm_ros.core.surface.freedoms import AUTO
+from omsm_ros.core.registration.freedoms import AUTO
 from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
 from omsm_ros.jobs.judge_form import judge_form
 from omsm_ros.jobs.measure import measure

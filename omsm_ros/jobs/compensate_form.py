@@ -11,7 +11,7 @@ import numpy as np
 from omsm_ros.core.form.compensation import compensation
 from omsm_ros.core.form.tool_path import ToolPath, path_gcode, spiral_offsets
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.readable import percent, quantity
 from omsm_ros.storage.files import save_text

@@ -10,8 +10,8 @@ import numpy as np
 
 from omsm_ros.core.form.analyse import Form
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.surface.freedoms import MOVES
-from omsm_ros.core.surface.placement import FREEDOMS, Aperture
+from omsm_ros.core.registration.freedoms import MOVES
+from omsm_ros.core.registration.placement import FREEDOMS, Aperture
 from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
 from omsm_ros.storage.maps.vertex_file import write_ply

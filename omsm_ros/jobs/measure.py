@@ -23,7 +23,7 @@ from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.form.conformity import conformity
 from omsm_ros.core.form.figures import Figure
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps

@@ -11,9 +11,9 @@ import numpy as np
 from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.registration.placement import Aperture, Portion, Portions
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.core.surface.placement import Aperture, Portion, Portions
 from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.fields_file import load_fields

@@ -9,12 +9,12 @@ import numpy as np
 
 from omsm_ros.core.comparison.stated_errors import Fields, Measurement
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.registration.placement import Placed, Portion, placed
+from omsm_ros.core.registration.pose_budget import Registration
+from omsm_ros.core.registration.register import register
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.core.surface.placement import Placed, Portion, placed
-from omsm_ros.core.surface.pose_budget import Registration
-from omsm_ros.core.surface.registration import register
 
 _PORTION = 65_536
 POSE = "pose of the part"

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.registration.alignment import Alignment, SphereScanReader, align_on_sphere
 from omsm_ros.core.samples.accounts import Account
 from omsm_ros.core.samples.blocks import AxisBlock
-from omsm_ros.core.surface.alignment import Alignment, SphereScanReader, align_on_sphere
 from omsm_ros.core.verification.resolved_calibration import (
     after_step_test,
     from_scans_alone,

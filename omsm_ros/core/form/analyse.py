@@ -22,19 +22,19 @@ from omsm_ros.core.form.removal import without_form, without_second_order
 from omsm_ros.core.form.texture import Bands, bands_of, texture
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.samples.even_selection import EvenSelection
-from omsm_ros.core.samples.scatter import noise_of
-from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.placement import (
+from omsm_ros.core.registration.placement import (
     Aperture,
     Placed,
     Portion,
     Portions,
     placed,
 )
-from omsm_ros.core.surface.pose_budget import Registration
-from omsm_ros.core.surface.registration import CHUNK, register
+from omsm_ros.core.registration.pose_budget import Registration
+from omsm_ros.core.registration.register import CHUNK, register
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.scatter import noise_of
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.zernike_terms import first_terms
 from omsm_ros.errors import DataError
 
@@ -78,7 +78,7 @@ def analyse_form(
 ) -> Form:
     """Register the points and judge what they deviate by.
 
-    portions: reads the points, see :class:`omsm_ros.core.surface.placement.Portion`
+    portions: reads the points, see :class:`omsm_ros.core.registration.placement.Portion`
     asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
     bounds: of these, the ones of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points

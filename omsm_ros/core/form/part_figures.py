@@ -24,8 +24,8 @@ import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap, Figure, weighted_quantiles
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
 # 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).

@@ -8,9 +8,9 @@ import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap
 from omsm_ros.core.form.power_density import Curve
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
-from omsm_ros.core.surface.placement import Aperture
 
 # Shares of the radius: half the width of a line's band, and the length of its stretches.
 _HALF_WIDTH, _SPACING = 1 / 100, 1 / 100

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
 
 # Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a

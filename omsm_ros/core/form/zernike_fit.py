@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, zernike_values
 from omsm_ros.errors import DataError
 

@@ -1,1 +1,1 @@
-"""From points to a result: nominal shapes and the deviation from them."""
+"""Nominal shapes: heights, slopes, poses; grids and points; the deviation from them."""

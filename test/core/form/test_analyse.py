@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
+from omsm_ros.core.registration.placement import Aperture, Portion
 from omsm_ros.core.surface.nominal import Flat, Sphere
-from omsm_ros.core.surface.placement import Aperture, Portion
 from omsm_ros.errors import DataError
 
 RNG = np.random.default_rng(6)

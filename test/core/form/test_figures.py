@@ -10,8 +10,8 @@ from omsm_ros.core.form.figures import (
     weighted_quantiles,
 )
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.scatter import noise_of
-from omsm_ros.core.surface.placement import Aperture
 
 DISC = Aperture(1e-2)
 POINTS = 20_000

@@ -8,7 +8,7 @@ from omsm_ros.core.form.optical_terms import optical_terms
 from omsm_ros.core.form.profiles import profiles
 from omsm_ros.core.form.removal import without_form
 from omsm_ros.core.form.zernike_fit import fit_zernikes
-from omsm_ros.core.surface.placement import Aperture
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values
 
 DISC = Aperture(10e-3, 1e-3, -2e-3)

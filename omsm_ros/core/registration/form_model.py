@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
 
 HIGHEST_ORDER = 8

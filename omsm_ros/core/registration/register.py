@@ -3,7 +3,7 @@
 Gauss–Newton with exact derivatives on an even selection of the points until the pose stands, then
 one pass over all of them; sums of products of the columns are all that is kept, so memory does not
 grow with the scan. Beside the pose the fit allows for the part's own form error, see
-:mod:`omsm_ros.core.surface.form_model`; dust is left out by its distance from that smooth form.
+:mod:`omsm_ros.core.registration.form_model`; dust lies far from that smooth form and is left out.
 """
 
 from __future__ import annotations
@@ -15,10 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples import scatter
-from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.form_model import (
+from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
     Estimate,
     FormBasis,
@@ -28,8 +25,8 @@ from omsm_ros.core.surface.form_model import (
     most_like,
     relaxed,
 )
-from omsm_ros.core.surface.freedoms import AUTO, HELD, Freedoms, determined, weakest, widest
-from omsm_ros.core.surface.placement import (
+from omsm_ros.core.registration.freedoms import AUTO, HELD, Freedoms, determined, weakest, widest
+from omsm_ros.core.registration.placement import (
     FREEDOMS,
     Aperture,
     Placement,
@@ -41,7 +38,10 @@ from omsm_ros.core.surface.placement import (
     selection,
     usable,
 )
-from omsm_ros.core.surface.pose_budget import Open, Registration, effects_of_held, root_of
+from omsm_ros.core.registration.pose_budget import Open, Registration, effects_of_held, root_of
+from omsm_ros.core.samples import scatter
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
 

@@ -13,8 +13,8 @@ from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.registration.alignment import SphereScan, align_on_sphere, sphere_scan_of
 from omsm_ros.core.samples.blocks import AxisBlock
-from omsm_ros.core.surface.alignment import SphereScan, align_on_sphere, sphere_scan_of
 from omsm_ros.core.surface.nominal import Sphere
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface import registration
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.freedoms import parsed_freedoms
-from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
-from omsm_ros.core.surface.placement import (
+from omsm_ros.core.registration import register as registering
+from omsm_ros.core.registration.freedoms import parsed_freedoms
+from omsm_ros.core.registration.placement import (
     FREEDOMS,
     Aperture,
     Placement,
@@ -20,8 +17,11 @@ from omsm_ros.core.surface.placement import (
     freedom_columns,
     placed,
 )
+from omsm_ros.core.registration.register import register
+from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.core.surface.posed import Pose, Sum
-from omsm_ros.core.surface.registration import register
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.figure_error import FigureError
 from omsm_ros.twin.part_pose import PartPose, posed
@@ -273,7 +273,7 @@ def test_a_small_piece_settles_though_its_form_looks_like_a_pose(size, seed):
 
 
 def test_a_pose_that_does_not_settle_is_refused_with_the_remedy(monkeypatch):
-    monkeypatch.setattr(registration, "_MOST_REFINED", 2)
+    monkeypatch.setattr(registering, "_MOST_REFINED", 2)
     with pytest.raises(DataError, match=r"does not settle.*--fit piston,tip,tilt"):
         fitted(PAPER_MIRROR, scan(PAPER_MIRROR))
 

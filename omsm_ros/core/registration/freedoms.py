@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from omsm_ros.core.registration.placement import FREEDOMS
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.placement import FREEDOMS
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.readable import quantity
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M

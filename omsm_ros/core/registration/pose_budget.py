@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.surface.form_model import FormBasis
-from omsm_ros.core.surface.freedoms import Freedoms, widest
-from omsm_ros.core.surface.placement import (
+from omsm_ros.core.registration.form_model import FormBasis
+from omsm_ros.core.registration.freedoms import Freedoms, widest
+from omsm_ros.core.registration.placement import (
     Aperture,
     Placed,
     Placement,
@@ -20,6 +19,7 @@ from omsm_ros.core.surface.placement import (
     freedom_columns,
     placed,
 )
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
