@@ -4,6 +4,7 @@ ros2 launch omsm_ros cell.launch.py params:=/path/to/my_cell
 ros2 launch omsm_ros cell.launch.py emulated:=true namespace:=cell2 record:=scan.mcap
 """
 
+import os
 from pathlib import Path
 from zlib import crc32
 
@@ -14,6 +15,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from omsm_ros.emulators.players import EMULATED, emulated
+from omsm_ros.nodes.start import LAUNCHED_BY
 from omsm_ros.storage.runtime_folder import runtime_folder
 
 SHARE = Path(get_package_share_directory("omsm_ros"))
@@ -75,6 +77,7 @@ def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Nod
         namespace=given["namespace"],
         parameters=[str(file), *([parameters] if parameters else [])],
         arguments=["--ros-args", "--log-level", given["log_level"]],
+        additional_env={LAUNCHED_BY: str(os.getpid())},
         respawn=given["respawn"] == "true",
         respawn_delay=1.0,
         output="screen",

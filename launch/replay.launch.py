@@ -5,6 +5,8 @@ ros2 launch omsm_ros replay.launch.py bag:=scan.mcap calibration:=cal.json [rate
 
 from __future__ import annotations
 
+import os
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
 from launch.event_handlers import OnProcessExit
@@ -12,6 +14,8 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+
+from omsm_ros.nodes.start import LAUNCHED_BY
 
 ARGUMENTS = {
     "bag": (None, "the .mcap file or rosbag2 folder to play"),
@@ -33,10 +37,12 @@ def generate_launch_description() -> LaunchDescription:
         for name, (default, described) in ARGUMENTS.items()
     ]
     namespace = LaunchConfiguration("namespace")
+    launched = {LAUNCHED_BY: str(os.getpid())}
     corrector = Node(
         package="omsm_ros",
         executable="corrector",
         namespace=namespace,
+        additional_env=launched,
         parameters=[{"calibration": _text("calibration")}],
         output="screen",
     )
@@ -44,6 +50,7 @@ def generate_launch_description() -> LaunchDescription:
         package="omsm_ros",
         executable="replay",
         namespace=namespace,
+        additional_env=launched,
         parameters=[
             {
                 "bag": _text("bag"),

@@ -1,6 +1,8 @@
 """What the launch file starts, on stand-ins for launch and launch_ros, which wheels lack."""
 
 import importlib.util
+import os
+import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +11,7 @@ from types import ModuleType
 import pytest
 
 import omsm_ros
+from omsm_ros.nodes.start import LAUNCHED_BY
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 
@@ -21,6 +24,7 @@ class Node:
     namespace: str = ""
     parameters: list = field(default_factory=list)
     remappings: list = field(default_factory=list)
+    additional_env: dict = field(default_factory=dict)
     respawn: bool = False
     respawn_delay: float = 0.0
     output: str = ""
@@ -114,6 +118,29 @@ def test_arguments_reach_the_nodes(launch):
     assert nodes["corrector"].respawn
     assert nodes["corrector"].arguments == ["--ros-args", "--log-level", "debug"]
     assert Path(nodes["rviz2"].arguments[1]).is_file()
+
+
+def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
+    """It is killed, or was before they had begun to listen for that."""
+    told = {made.additional_env[LAUNCHED_BY] for made in launch(record="x").values()}
+    assert told == {str(os.getpid())}
+    node = (
+        "from omsm_ros.nodes.start import end_with_launch; end_with_launch(); import time;"
+        "print('begins', flush=True); time.sleep(10); print('left alone')"
+    )
+    start = (
+        "import os, subprocess, sys;"
+        f"told = os.environ | {{{LAUNCHED_BY!r}: str(os.getpid())}};"
+        f"subprocess.run([sys.executable, '-c', {node!r}], env=told)"
+    )
+    with subprocess.Popen([sys.executable, "-c", start], stdout=subprocess.PIPE, cwd=ROOT) as made:
+        assert made.stdout.readline() == b"begins\n"
+        made.kill()
+        assert made.stdout.read() == b""
+    told = os.environ | {LAUNCHED_BY: str(made.pid)}
+    late = subprocess.run([sys.executable, "-c", node], env=told, cwd=ROOT, capture_output=True)
+    assert late.returncode == 1
+    assert b"has ended" in late.stderr
 
 
 def test_a_folder_without_the_yaml_is_an_error(launch, tmp_path):

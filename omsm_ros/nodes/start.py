@@ -8,6 +8,7 @@ workspace whose messages were not built. ``python -m omsm_ros.nodes.start correc
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import signal
@@ -19,7 +20,11 @@ from pathlib import Path
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a node to end."""
 
+LAUNCHED_BY = "OMSM_LAUNCHED_BY"
+"""Variable with the process number of the launch that started a node, and that it ends with."""
+
 _BAD_INPUT = 2
+_PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OTHER_NAMES = {"replay": "player"}
 _NO_ROS = (
     "ROS 2 Jazzy is not in this Python: source /opt/ros/jazzy/setup.bash, or '. ./env.sh' after "
@@ -36,6 +41,7 @@ def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
     with nothing_to_undo():
+        end_with_launch()
         for package, remedy in _NEEDED.items():
             try:
                 importlib.import_module(package)
@@ -44,6 +50,22 @@ def main() -> None:
                 sys.exit(_BAD_INPUT)
         node = importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node")
     node.main()
+
+
+def end_with_launch() -> None:
+    """Have SIGTERM sent to this process when the launch that started it ends, however it does.
+
+    ``ros2 launch`` hands Ctrl-C on; a SIGTERM, as ``docker stop`` sends one, or a SIGKILL ends it
+    alone, and its nodes would keep the device and the recording until somebody finds them.
+    """
+    launch = os.environ.pop(LAUNCHED_BY, "")
+    if not launch or sys.platform != "linux":
+        return
+    child = launch == str(os.getppid())  # and not a child of a prefix, as a terminal or debugger
+    if child:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
+        sys.exit(f"the launch that started this node ({launch}) has ended")
 
 
 @contextmanager
