@@ -102,7 +102,7 @@ class Agreement:
 
 
 def peak_to_valley(values: FloatArray) -> FloatArray:
-    """Largest less smallest of values (…, m)."""
+    """Return the largest less smallest of values (…, m)."""
     return np.asarray(np.ptp(values, axis=-1))
 
 
@@ -114,7 +114,7 @@ def robust_peak_to_valley(values: FloatArray) -> FloatArray:
 
 
 def root_mean_square(values: FloatArray) -> FloatArray:
-    """Rms of values (…, m) about zero."""
+    """Return the rms of values (…, m) about zero."""
     return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
 
 
@@ -173,7 +173,7 @@ def judge(
 
 
 def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]:
-    """Figures with the scatter that the errors give them, by Monte Carlo (GUM supplement 1)."""
+    """Return figures with the scatter of ``errors`` in them, by Monte Carlo (GUM supplement 1)."""
     plain = figures_of(matched)
     heights = matched.without_fit(np.stack([matched.a, matched.b]))
     found = {}
@@ -192,7 +192,7 @@ def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]
 def _drawn(
     matched: Matched, errors: tuple[Errors, Errors], shared: Collection[str]
 ) -> list[FloatArray]:
-    """Errors of both, each (draws, m) [m]; the same for the same input."""
+    """Return the errors of both, each (draws, m) [m]; the same for the same input."""
     random = np.random.default_rng(0)
     made = [_noise(matched, side, random) for side in errors]
     common: dict[str, FloatArray] = {}
@@ -206,7 +206,7 @@ def _drawn(
 
 
 def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> FloatArray:
-    """Independent errors as the local fits pass them on (draws, m) [m].
+    """Return the independent errors as the local fits pass them on (draws, m) [m].
 
     Places share points with their neighbours: so much smoothed, white noise of the size of means
     has the size of single heights. A Gaussian of width σ leaves 1 / 4πσ² of the variance.
@@ -225,7 +225,7 @@ def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> Float
 def _terms(
     matched: Matched, fitted: FloatArray, averaged: FloatArray
 ) -> tuple[tuple[TermNumber, ...], float, tuple[float, float, float]]:
-    """Zernike terms of the difference beside the fitted freedoms, and how likely they all are."""
+    """Return Zernike terms of the difference beside the fitted freedoms, and how likely all are."""
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
     radius = float(np.max(np.hypot(matched.x - x0, matched.y - y0)))
     u, v = (matched.x - x0) / radius, (matched.y - y0) / radius
@@ -244,7 +244,7 @@ def _terms(
 
 
 def _rows(matched: Matched, values: FloatArray) -> tuple[list[Term], FloatArray]:
-    """Terms that the fitted freedoms leave to be told, and the weights (t, m) of the places."""
+    """Return the terms that stay identifiable beside the fitted freedoms, and weights (t, m)."""
     free = matched.without_fit(values)
     own = np.linalg.norm(free, axis=1) / np.linalg.norm(values, axis=1)
     kept = np.flatnonzero(own > _LEAST_OWN_SHARE)

@@ -61,12 +61,12 @@ class Trend:
         ]
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Its height [m], (n,)."""
+        """Return its height [m], (n,)."""
         parts = [self._columns(x[p], y[p]) @ self._coefficients for p in portions(len(x))]
         return np.concatenate([np.empty(0), *parts])
 
     def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Its slopes [1], each (n,)."""
+        """Return its slopes [1], each (n,)."""
         step = 1e-5 * self._scale
         return (
             (self.at(x + step, y) - self.at(x - step, y)) / (2 * step),

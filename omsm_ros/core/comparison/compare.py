@@ -177,7 +177,7 @@ def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]
 
 
 def _beside_each_other(matched: Matched) -> tuple[str, ...]:
-    """What a small shift between the two would do to heights that are steep."""
+    """Return what a small shift between the two would do to heights that are steep."""
     there = matched.from_b
     each = {"x": there.slope_x, "y": there.slope_y}
     slopes = [slope for name, slope in each.items() if name not in matched.freedoms]
@@ -196,13 +196,13 @@ def _beside_each_other(matched: Matched) -> tuple[str, ...]:
 
 
 def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:
-    """Of the smaller area, the share that both cover."""
+    """Return the share of the smaller area that both cover [1]."""
     both = float(np.sum(matched.filled)) * side**2
     return min(both / min(_area(points, side) for points in (a, b)), 1.0)
 
 
 def _area(points: MeasuredPoints, side: float) -> float:
-    """Area that the points cover [m²], by cells of ``side`` that hold any."""
+    """Return the area that the points cover [m²], by cells of ``side`` that hold any."""
     column, row = (np.floor(v / side).astype(np.int64) for v in (points.x, points.y))
     cells = np.unique((column - column.min()) * (int(np.ptp(row)) + 1) + row - row.min())
     return len(cells) * side**2

@@ -128,7 +128,7 @@ class _Seen:
     v: FloatArray
 
     def step(self) -> dict[str, float]:
-        """Least-squares size of each freedom."""
+        """Return the least-squares size of each freedom."""
         design = np.stack(list(self.columns.values()), axis=1)
         scale = np.linalg.norm(design, axis=0)
         solved = np.linalg.lstsq(design / scale, self.a - self.b, rcond=1e-10)[0] / scale
@@ -158,7 +158,7 @@ class _Places:
         return _Seen(filled, *heights, columns, there, u[filled], v[filled])
 
     def columns_of_first(self, filled: BoolArray, freedoms: Sequence[str]) -> dict[str, FloatArray]:
-        """What each freedom would do to the first measurement where both have heights (n,)."""
+        """Return what each freedom does to the first measurement where both have heights (n,)."""
         here, x, y = _part(self._here, filled), self.x[filled], self.y[filled]
         return {name: _column(name, x, y, here) for name in freedoms}
 
@@ -191,7 +191,7 @@ class _Places:
 def _taken(
     b: LocalQuadratic, x: FloatArray, y: FloatArray, moved: Mapping[str, float]
 ) -> tuple[LocalHeights, FloatArray, FloatArray]:
-    """b where its points lie once they are moved to x, y, and those places in b's own frame."""
+    """Return b where its points lie once moved to x, y, and those places in b's own frame."""
     angle = moved.get("clocking", 0.0)
     dx, dy = x - moved.get("x", 0.0), y - moved.get("y", 0.0)
     u = dx * np.cos(angle) + dy * np.sin(angle)
@@ -214,7 +214,7 @@ def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> Flo
 def _not_determined(
     columns: dict[str, FloatArray], of_first: dict[str, FloatArray], place: float
 ) -> dict[str, str]:
-    """Which freedoms sideways the surface does not tell from the others, and why.
+    """Return which freedoms sideways the surface does not tell from the others, and why.
 
     columns, of_first: of the second and of the first measurement. What both have in common is of
     the surface; the rest is the noise of their slopes, which tells nothing.
@@ -241,7 +241,7 @@ def _not_determined(
 
 
 def _own(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
-    """The part of a column (n,) that the others do not explain."""
+    """Return the part of a column (n,) that the others do not explain."""
     design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]
     return np.asarray(column - design @ np.linalg.lstsq(design, column, rcond=1e-10)[0])
 

@@ -87,7 +87,7 @@ class LocalQuadratic:
         self._scatter = spread(residual) if len(residual) else 0.0
 
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
-        """Heights, slopes and their uncertainties at x, y [m], each (m,)."""
+        """Return the heights, slopes and their uncertainties at x, y [m], each (m,)."""
         found = self._fitted(x, y, RADIUS_CELLS * self.cell)
         tx, ty = self._trend.slopes(x, y)
         return LocalHeights(
@@ -110,7 +110,7 @@ class LocalQuadratic:
         return self._scatter
 
     def carried(self, rows: Rows, x: FloatArray, y: FloatArray) -> FloatArray:
-        """What is so much at the points is so much at x, y (m,): rows of errors, (s, m) [m].
+        """Carry errors of the points to x, y (m,): return them row by row, (s, m) [m].
 
         rows: errors (s, c) [m] of ``c`` points from a first one on
         """
@@ -124,7 +124,7 @@ class LocalQuadratic:
         return np.concatenate([np.empty((len(means), 0)), *parts], axis=1)
 
     def _means(self, rows: Rows) -> FloatArray:
-        """Mean of each row over the points of each cell, (s, k)."""
+        """Return the mean of each row over the points of each cell, (s, k)."""
         sums: FloatArray | None = None
         for p in portions(len(self._cell)):
             cell = self._cell[p]
@@ -136,7 +136,7 @@ class LocalQuadratic:
         return np.empty((0, 0)) if sums is None else sums / self._cells.points
 
     def method_error(self, x: FloatArray, y: FloatArray) -> float:
-        """Rms error of the interpolation at places like x, y (m,) [m], from above.
+        """Return the rms error of the interpolation at places like x, y (m,) [m], from above.
 
         The error of a quadratic grows with the fourth power of its radius, and with a lower one
         where the radius nears the wavelength. With the third, what a radius half as large again
@@ -173,7 +173,7 @@ class LocalQuadratic:
     def _shares(
         self, x: FloatArray, y: FloatArray, radius: float
     ) -> tuple[BoolArray, FloatArray, IntArray]:
-        """Which places (m,) cells surround; of those, the shares (g, 3, k) of cells (g, k).
+        """Return which places (m,) cells surround; of those, the shares (g, 3, k) of cells (g, k).
 
         Shares in the value and in both slopes times the radius.
         """
@@ -198,7 +198,7 @@ class LocalQuadratic:
     def _surrounded(
         u: FloatArray, v: FloatArray, weight: FloatArray, inside: BoolArray
     ) -> BoolArray:
-        """Where the cells lie on all sides of the place, and not along one line."""
+        """Return where the cells lie on all sides of the place, and not along one line."""
         total = np.maximum(weight.sum(axis=1), np.finfo(np.float64).tiny)
         centre = np.hypot((weight * u).sum(axis=1), (weight * v).sum(axis=1)) / total
         uu, vv, uv = ((weight * p).sum(axis=1) / total for p in (u * u, v * v, u * v))
@@ -210,7 +210,7 @@ class LocalQuadratic:
 def _first_rows(
     u: FloatArray, v: FloatArray, moments: list[FloatArray], weight: FloatArray
 ) -> FloatArray:
-    """Weights of the cells in the value and in both slopes of the local quadratic, (m, 3, k).
+    """Return the cells' weights in value and slopes of the local quadratic, (m, 3, k).
 
     What is fitted to the mean of a cell is the mean of the quadratic over its points.
     """

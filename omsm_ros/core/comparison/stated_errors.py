@@ -112,7 +112,7 @@ def errors_of(
 
 
 def _shared(halves: tuple[Half, Half], errors: tuple[Errors, Errors]) -> tuple[str, ...]:
-    """Sources of one and the same error in both: those of the calibration that both used."""
+    """Return sources of one and the same error in both: those of the calibration that both used."""
     ids = {half.measurement.calibration for half in halves}
     if len(ids) > 1 or not all(ids):
         return ()
@@ -136,7 +136,7 @@ def _known(half: Half, matched: Matched, length: float) -> Errors | None:
 
 
 def _shapes(half: Half, matched: Matched, length: float) -> dict[str, FloatArray] | None:
-    """Shapes by source, each (k, m) [m]; None if nobody states any."""
+    """Return the shapes by source, each (k, m) [m]; None if nobody states any."""
     m = half.measurement
     pose = {} if m.pose is None else _carried(half, m.pose)
     if m.fields is not None:
@@ -148,7 +148,7 @@ def _shapes(half: Half, matched: Matched, length: float) -> dict[str, FloatArray
 
 
 def _carried(half: Half, fields: Fields) -> dict[str, FloatArray]:
-    """Fields of the points as shapes at the places, by source, each (k, m) [m]."""
+    """Return the fields of the points as shapes at the places, by source, each (k, m) [m]."""
     if not fields.names:
         return {}
     rows = half.surface.carried(fields.at, half.x, half.y)
@@ -164,7 +164,7 @@ def _drifts(
     known: tuple[Errors, Errors],
     shared: tuple[str, ...],
 ) -> list[dict[str, FloatArray]]:
-    """Shapes of the drift of both; what nobody states is estimated from the difference itself."""
+    """Return shapes of both drifts; one that nobody states is estimated from the difference."""
     found: list[dict[str, FloatArray]] = [{}, {}]
     longest = max(half.measurement.duration for half in halves)
     unit: dict[int, FloatArray] = {}

@@ -70,7 +70,7 @@ def verdict_of(
 
 
 def _least_sure(found: Agreement) -> str:
-    """The terms of the largest uncertainty, with it."""
+    """Return the terms of the largest uncertainty, with it."""
     terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
     return ", ".join(f"{quantity(t.expanded, 'm')} of {_named(t.n, t.m)}" for t in terms)
 

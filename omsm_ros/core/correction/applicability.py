@@ -28,7 +28,7 @@ def objections(
     probe: Sequence[Mapping[str, object]] = (),
     polarity: int | None = None,
 ) -> tuple[str, ...]:
-    """Why ``calibration`` should not be used; empty if nothing speaks against it.
+    """Return why ``calibration`` should not be used; empty if nothing speaks against it.
 
     sample_period: of the data [s];  polarity: that the correction will use
     settings: as they are now; a name that both sides know must have the same value, one that
@@ -50,7 +50,7 @@ def objections(
 
 
 def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) -> dict[str, object]:
-    """What to record of the decision to use a calibration, as JSON values.
+    """Return what to record of the decision to use a calibration, as JSON values.
 
     Raises CalibrationError with all ``reasons`` unless there are none or ``override`` is set.
     """

@@ -66,7 +66,7 @@ class BudgetRow:
     reason: str
 
     def entry(self) -> dict[str, Any]:
-        """For ``summary.json``: JSON values."""
+        """Return the JSON values of ``summary.json``."""
         return asdict(self)
 
 
@@ -100,7 +100,7 @@ class ScanBudget:
         return {name: _height(fields) for name, fields in self.fields.items()}
 
     def entry(self) -> dict[str, Any]:
-        """For ``summary.json``: JSON values."""
+        """Return the JSON values of ``summary.json``."""
         return {
             "random": self.random,
             "systematic": self.systematic,

@@ -46,7 +46,7 @@ class CalibrationSet(Calibration):
     members: tuple[Calibration, ...]
 
     def content(self) -> dict[str, object]:
-        """The set as JSON values, without its id."""
+        """Return the set as JSON values, without its id."""
         return {
             "schema": SET_SCHEMA,
             "along": self.along,

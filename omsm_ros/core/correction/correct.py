@@ -162,7 +162,7 @@ class Corrector:
         return max(live if self._most_waiting is None else self._most_waiting, len(newest))
 
     def take(self) -> SurfacePoints | None:
-        """Points completed since the last call, None if there are none."""
+        """Return the points completed since the last call, None if there are none."""
         if not self._ready:
             return None
         points = self._ready[0] if len(self._ready) == 1 else join_points(self._ready)
@@ -275,7 +275,7 @@ class Corrector:
         )
 
     def _of_dynamics(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
-        """Variance of H(z) from the noise of the step test, and from what could hide, (n,)."""
+        """Return the variances of H(z) [m²], (n,), by the step test's noise and by hidden terms."""
         noise, hidden = np.zeros((2, len(points)))
         for row, may_hide in zip(points.dynamics, points.hidden, strict=True):
             total = hidden if may_hide else noise
@@ -306,13 +306,13 @@ class Corrector:
 
 
 def _without_gaps(chosen: BoolArray) -> BoolArray | slice:
-    """``chosen`` (n,) as a slice where it is one: at the start of a scan nothing is copied."""
+    """Return ``chosen`` (n,), as a slice where it is one: then nothing is copied."""
     first, last = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
     return slice(first, last) if np.sum(chosen) == last - first else chosen
 
 
 def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
-    """By how much X, Y, B and C are delayed [s]: as told, else by the latency that is known."""
+    """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
     stated = options.lateral_lag
     return latency_of(calibration).delay_s if stated is None else stated
 

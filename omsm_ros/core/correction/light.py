@@ -99,7 +99,7 @@ class Light:
     reasons: tuple[Reason, ...]
 
     def entry(self) -> dict[str, Any]:
-        """For ``summary.json``: JSON values."""
+        """Return the JSON values of ``summary.json``."""
         return asdict(self)
 
 

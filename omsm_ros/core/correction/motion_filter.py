@@ -68,7 +68,7 @@ class MotionFilters:
         lateral_lag: float = 0.0,
         order: int = DEFAULT_ORDER,
     ) -> MotionFilters:
-        """The filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
+        """Return the filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator)
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
@@ -87,7 +87,7 @@ class MotionFilters:
         )
 
     def settling_samples(self) -> int:
-        """Samples until a wrong start is forgotten to ``SETTLED`` of itself."""
+        """Return the samples until a wrong start is forgotten to ``SETTLED`` of itself."""
         settled = self.height.settling_samples(SETTLED)
         # A slow pole with a small share of the response is forgotten long before its decay ends.
         settled = min(settled, self.forgotten + 2 * len(self.height.sections))
@@ -225,7 +225,7 @@ class MotionFilter:
         return done
 
     def end(self) -> list[Run]:
-        """The stream ends here: what was too short to start on comes out as settling."""
+        """End the stream; return what was too short to start on, as settling."""
         self._next = None
         return self._break()
 

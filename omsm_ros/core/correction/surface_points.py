@@ -37,7 +37,7 @@ class SurfacePoints:
         return len(self.sample)
 
     def part(self, place: slice | BoolArray) -> SurfacePoints:
-        """The points at ``place``, without a stamp."""
+        """Return the points at ``place``, without a stamp."""
         return SurfacePoints(**{name: getattr(self, name)[place] for name in _COLUMNS})
 
 
@@ -50,7 +50,7 @@ _NO_POINTS = SurfacePoints(
 
 
 def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
-    """All points of ``parts`` in their order; None counts as no points."""
+    """Return all points of ``parts`` in their order; None counts as no points."""
     present = [part for part in parts if part is not None and len(part)] or [_NO_POINTS]
     columns = {name: np.concatenate([getattr(p, name) for p in present]) for name in _COLUMNS}
     return SurfacePoints(**columns, stamp_ns=present[0].stamp_ns)
@@ -74,7 +74,7 @@ POINT_DTYPE = np.dtype(list(CLOUD_FIELDS), align=True)
 
 
 def pack_points(points: SurfacePoints, dtype: np.dtype[np.void] = POINT_DTYPE) -> NDArray[np.void]:
-    """Points as a structured array (n,) of ``dtype``, of the contract's fields.
+    """Return the points as a structured array (n,) of ``dtype``, of the contract's fields.
 
     z repeats height for viewers.
     """

@@ -79,7 +79,7 @@ class ErrorSources:
 
     @classmethod
     def of(cls, calibration: Calibration) -> ErrorSources:
-        """What the calibration's certificate tells; what it does not tell counts as zero.
+        """Return what the calibration's certificate states; what it does not state counts as zero.
 
         But for the latency: where nothing divides the lag, any part of it may be latency.
         Its noise is that of readings at rest, so it holds the probe's resolution already.
@@ -93,7 +93,7 @@ class ErrorSources:
 
 
 def sources_with(calibration: Calibration, stated: Mapping[str, object]) -> ErrorSources:
-    """The sources the calibration tells of, those ``stated`` by name in their place.
+    """Return the sources that the calibration states, replaced by those ``stated`` by name.
 
     Raises ConfigurationError for a name that is no source, or a value that is no uncertainty.
     """
@@ -118,7 +118,7 @@ def contributions(
     z_rate: FloatArray,
     abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
-    """Variances of the heights [m²] by their source, each (n,) or the same for all points.
+    """Return variances of the heights [m²] by their source, each (n,) or the same for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
     dynamics, hidden: variance of H(z) [m²] from the noise of the step test, and from what the
@@ -140,7 +140,7 @@ def contributions(
 
 
 def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) -> dict[str, float]:
-    """Variances of a height [m²] by what scatters from reading to reading.
+    """Return the variances of a height [m²] by what scatters from reading to reading.
 
     noise_gain: of H for white noise
     """
@@ -154,7 +154,7 @@ def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) ->
 
 
 def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> SurfacePoints:
-    """The points with ``lateral`` [m], their standard uncertainty sideways, times the slope.
+    """Return the points with ``lateral`` [m], their standard uncertainty sideways, times the slope.
 
     The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
     """
@@ -167,7 +167,7 @@ def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> Sur
 
 
 def uncertain_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
-    """The calibration with the covariance from noise alone, and with that of what could hide."""
+    """Return the calibration with the covariance of noise alone, and with that of hidden terms."""
     hidden = calibration.hidden_covariance
     return (
         replace(calibration, covariance=calibration.covariance - hidden),
@@ -176,7 +176,7 @@ def uncertain_parts(calibration: Calibration) -> tuple[Calibration, Calibration]
 
 
 def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[DigitalFilter]:
-    """Filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none if the covariance is zero."""
+    """Return filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none for a zero covariance."""
     g = calibration.dynamics
     square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
     combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
@@ -197,7 +197,7 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
 
 
 def at_rest_until(calibration: Calibration) -> float:
-    """Time [s] over which a motion counts as rest, whose gain is one; 0 if there is no such.
+    """Return the time [s] over which a motion counts as rest, whose gain is one; 0 without one.
 
     A calibration that leaves open how slow relaxations go carries a variance of the whole
     gain, which holds above ``valid_from`` of its certificate.
@@ -218,7 +218,7 @@ def derivative_filter(
     sample_period: float,
     poles: ComplexArray,
 ) -> DigitalFilter:
-    """A filter for a ratio whose numerator may exceed the denominator by one degree.
+    """Return a filter for a ratio whose numerator may exceed the denominator by one degree.
 
     Such a ratio, the derivative of a response that does not fall, gets a pole above the
     Nyquist frequency: below a tenth of it that is 1 % of magnitude. Where a resonance folds
@@ -237,14 +237,14 @@ def derivative_filter(
 
 
 def sensitivity_numerators(calibration: Calibration) -> FloatArray:
-    """F_r times denominator², ascending powers of s, one row a direction of the covariance."""
+    """Return F_r times denominator², ascending powers of s, a row a direction of the covariance."""
     g = calibration.dynamics
     per_parameter = _sensitivity_numerators(g.numerator, g.denominator)
     return np.asarray(_factor(calibration.covariance).T @ per_parameter, np.float64)
 
 
 def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """∂G/∂θ_j times denominator², ascending powers of s, one row a parameter."""
+    """Return ∂G/∂θ_j times denominator², ascending powers of s, one row a parameter."""
     m, n = len(numerator) - 1, len(denominator) - 1
     rows = np.zeros((m + n + 2, max(2 * n, m + n + 1) + 1))
     for i in range(m + 1):
@@ -256,7 +256,7 @@ def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> F
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """L with L Lᵀ = covariance, (p, rank); scaled first, for the variances span many decades."""
+    """Return L with L Lᵀ = covariance, (p, rank); scaled first, as variances span many decades."""
     deviations = np.sqrt(np.diag(covariance))
     free = np.flatnonzero(deviations)
     correlation = covariance[np.ix_(free, free)] / np.outer(deviations[free], deviations[free])

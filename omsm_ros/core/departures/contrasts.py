@@ -53,7 +53,7 @@ def contrasts(survey: Survey) -> list[Contrast]:
 
 
 def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
-    """1 in the first part and -1 in the second, (n,), for each pair of parts."""
+    """Yield 1 in the first part and -1 in the second, (n,), for each pair of parts."""
     if len(steps.edges) < _LEAST_EDGES:
         return
     heights = np.array([edge.height for edge in steps.edges])

@@ -87,7 +87,7 @@ class Family:
         return int(self.columns.shape[1] // len(self.parameters))
 
     def term(self, index: int) -> Term:
-        """The term at ``index``."""
+        """Return the term at ``index``."""
         part = slice(index * self.width, (index + 1) * self.width)
         damping = 0.0 if self.dampings is None else float(self.dampings[index])
         parameter = float(self.parameters[index])
@@ -154,7 +154,7 @@ class Departures:
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
 
     def creep(self) -> Family:
-        """``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
+        """Return ``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
 
         In time and from rest: a relaxation longer than the record remembers how it began.
         """
@@ -166,7 +166,7 @@ class Departures:
         return Family(CREEP, found, 3.0, np.column_stack(columns))
 
     def modes(self) -> Family:
-        """``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a."""
+        """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a."""
         lowest = 2 / self.duration
         highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, _FASTEST_MODE_HZ)
         ladder = [
@@ -183,7 +183,7 @@ class Departures:
         return Family(MODE, frequencies, len(ladder) / 2, columns, dampings)
 
     def vibration(self) -> Family:
-        """Sine and cosine at the strongest lines of the residual."""
+        """Return the sine and cosine at the strongest lines of the residual."""
         used = self.problem.used
         samples = len(used)
         left = np.zeros(samples)
@@ -246,7 +246,7 @@ class Departures:
         return Family(PERIODIC, np.asarray(travel / cycles), trials, columns)
 
     def friction(self) -> Iterator[Family]:
-        """Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
+        """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
         if not self.steps.edges:
             return
         columns = [
@@ -296,7 +296,7 @@ def _geometric(low: float, high: float, step: float) -> FloatArray:
 
 
 def relaxed(values: FloatArray, step: float) -> FloatArray:
-    """``values`` (n,) through 1 / (1 + sτ), at rest before; ``step`` is a sample period over τ.
+    """Return ``values`` (n,) through 1 / (1 + sτ), at rest before; ``step``: sample period over τ.
 
     The values run straight from sample to sample.
     """

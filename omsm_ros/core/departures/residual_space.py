@@ -71,7 +71,7 @@ class ResidualSpace:
         return np.asarray(compared - self._basis @ (self._basis.T @ compared))
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
-        """χ² of each group of ``terms`` neighbouring columns of (n, c), as if noise were white.
+        """Return χ² of each group of ``terms`` neighbouring columns of (n, c), as for white noise.
 
         To find the best of many; :meth:`score` then judges it.
         """
@@ -110,7 +110,7 @@ class ResidualSpace:
         return Score(size, covariance, chi_square, degrees)
 
     def _covariance(self, inverse: FloatArray, left: FloatArray) -> FloatArray:
-        """Covariance (c, c) of ``inverse`` (c, k) times noise of the spectrum of ``left`` (k,)."""
+        """Return the covariance (c, c) of ``inverse`` (c, k) times noise coloured as ``left``."""
         used = self.problem.used
         length = fft.next_fast_len(len(used), real=True)
         rows = np.zeros((len(inverse), len(used)))

@@ -106,7 +106,7 @@ class Survey:
         return sorted(shown, key=self.evidence, reverse=True)
 
     def evidence(self, judged: Judged) -> float:
-        """Logarithm of the odds for ``judged``."""
+        """Return the logarithm of the odds for ``judged``."""
         return judged.evidence(self.fitted.samples)
 
     @property

@@ -10,7 +10,7 @@ from omsm_ros.errors import DataError
 
 
 def folded_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
-    """Apparent frequency [Hz] of ``frequency`` [Hz] sampled at ``sample_rate`` [Hz].
+    """Return the apparent frequency [Hz] of ``frequency`` [Hz] sampled at ``sample_rate`` [Hz].
 
     ``|f - fs · NINT(f / fs)|`` with halves rounded up, as the paper has it; of the shape of
     ``frequency``.
@@ -22,7 +22,7 @@ def folded_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
 
 
 def sampling_distance(radius: float, spindle_speed: float, sample_rate: float) -> float:
-    """Distance along the track between two samples [m].
+    """Return the distance along the track between two samples [m].
 
     radius: of the track [m];  spindle_speed: [rpm];  sample_rate: [Hz]
     """

@@ -106,7 +106,7 @@ class Calibration:
         return low_frequency_delay_uncertainty(self.dynamics, self.noise_covariance)
 
     def content(self) -> dict[str, object]:
-        """The calibration as JSON values, without its id."""
+        """Return the calibration as JSON values, without its id."""
         return {
             "schema": SCHEMA,
             "numerator": self.dynamics.numerator.tolist(),
@@ -122,7 +122,7 @@ class Calibration:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Calibration:
-        """The inverse of :meth:`content`, for values of the right types.
+        """Return the inverse of :meth:`content`, for values of the right types.
 
         This is the door for calibrations, from a file or over the network: raises
         CalibrationError for one that no machine has, or that cannot be computed with.
@@ -159,14 +159,14 @@ class Calibration:
 
 
 def verdict_of(calibration: Calibration) -> tuple[str, list[str]]:
-    """Verdict of the certificate, empty if it has none, and its reasons."""
+    """Return the verdict of the certificate, empty if it has none, and its reasons."""
     reasons = calibration.certificate.get("reasons")
     texts = [str(reason) for reason in reasons] if isinstance(reasons, list) else []
     return str(calibration.certificate.get("verdict", "")), texts
 
 
 def content_id(content: Mapping[str, object]) -> str:
-    """SHA-256 of the canonical JSON of ``content``: sorted keys, shortest exact numbers."""
+    """Return SHA-256 of the canonical JSON of ``content``: sorted keys, shortest exact numbers."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
 

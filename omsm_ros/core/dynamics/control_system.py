@@ -10,7 +10,7 @@ from omsm_ros.errors import ConfigurationError
 
 
 def to_control(dynamics: TransferFunction, delay_order: int = 3) -> control.TransferFunction:
-    """``dynamics`` as a ``control.TransferFunction`` in rad/s.
+    """Return ``dynamics`` as a ``control.TransferFunction`` in rad/s.
 
     A delay becomes a Padé approximant of ``delay_order``, good up to about
     ``delay_order / delay`` rad/s: python-control has no delay of its own.

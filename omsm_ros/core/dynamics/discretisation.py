@@ -40,7 +40,7 @@ class DigitalFilter:
     sample_period: float
 
     def response(self, frequency: FloatArray) -> ComplexArray:
-        """H at ``frequency`` [Hz], of the same shape."""
+        """Return H at ``frequency`` [Hz], of the same shape."""
         backward = np.exp(-2j * np.pi * np.asarray(frequency) * self.sample_period)
         result = np.ones_like(backward)
         for section in self.sections:
@@ -54,7 +54,7 @@ class DigitalFilter:
         return np.concatenate([np.roots(section[3:]) for section in self.sections])
 
     def settling_samples(self, tolerance: float) -> int:
-        """Samples until a wrong start is forgotten to ``tolerance`` of itself."""
+        """Return the samples until a wrong start is forgotten to ``tolerance`` of itself."""
         slowest = float(max(abs(self.poles)))
         recursive = np.log(tolerance) / np.log(slowest) if slowest > 0 else 0.0
         return int(np.ceil(recursive)) + 2 * len(self.sections)
@@ -98,7 +98,7 @@ def discretise(
 
 
 def _checked(digital: DigitalFilter, dynamics: TransferFunction) -> DigitalFilter:
-    """Slow motion shows a resonance that folds to it, and roots that rounding has moved."""
+    """Raise DataError where H misses G at slow motion: folded resonances, or roots ill rounded."""
     slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * digital.sample_period)
     if not np.allclose(digital.response(slow), dynamics.response(slow), rtol=_TOLERANCE, atol=0.0):
         raise DataError(
@@ -116,7 +116,7 @@ def _gain(
     poles: ComplexArray,
     late: int,
 ) -> float:
-    """The factor that makes H equal to G at 0 Hz, or close to 0 where G(0) = 0."""
+    """Return the factor that makes H equal to G at 0 Hz, or close to 0 where G(0) = 0."""
     angle = 0.0 if dynamics.dc_gain != 0 else _MATCHED_RAD
     z = np.exp(1j * angle)
     monic = np.prod(1 - zeros / z) / np.prod(1 - poles / z) * z**-late
@@ -125,7 +125,7 @@ def _gain(
 
 
 def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
-    """Second-order sections of ``late`` whole samples of delay and Π(1 - z_i/z) / Π(1 - p_i/z)."""
+    """Return the sections of z^-late Π(1 - z_i/z) / Π(1 - p_i/z), scaled by ``gain``."""
     pairs, single = divmod(late, 2)
     delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
     rational = second_order_sections(zeros, poles, gain)
@@ -135,7 +135,7 @@ def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) 
 def bilinear(
     dynamics: TransferFunction, sample_period: float, poles: ComplexArray | None = None
 ) -> DigitalFilter:
-    """The bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
+    """Return the bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
     roots = dynamics.poles() if poles is None else poles
     zeros, digital, gain = bilinear_roots(dynamics.zeros(), roots, leading, sample_period)
@@ -143,7 +143,7 @@ def bilinear(
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
-    """A delay of ``delay`` samples: leading whole samples, and zeros of the interpolator."""
+    """Return a delay of ``delay`` samples: leading whole samples, and zeros of the interpolator."""
     if delay == 0:
         return 0, np.empty(0, np.complex128)
     whole = max(int(np.floor(delay)) - (order - 1) // 2, 0)

@@ -44,7 +44,7 @@ class Audit:
 
 
 def checked_motion(z: FloatArray) -> FloatArray:
-    """``z`` (n,) as float64; raises DataError if it is too short or not finite."""
+    """Return ``z`` (n,) as float64; raises DataError if it is too short or not finite."""
     motion = np.asarray(z, np.float64)
     if motion.ndim != 1 or len(motion) < MIN_SAMPLES:
         raise DataError(f"motion of shape {motion.shape!r}, expected {MIN_SAMPLES} samples or more")
@@ -57,7 +57,7 @@ def checked_motion(z: FloatArray) -> FloatArray:
 def velocity_spectrum(
     z: FloatArray, sample_period: float, faded: bool = False
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies [Hz] (k,) and the windowed velocity's spectrum [m/s] (k,).
+    """Return the frequencies [Hz] (k,) and the windowed velocity's spectrum [m/s] (k,).
 
     faded: a window that fades only the ends, instead of one that leaks least
 
@@ -80,7 +80,7 @@ def velocity_spectrum(
 
 
 def fast_length(samples: int) -> int:
-    """The least product of a power of two with 1, 3, 5 or 9 that is not below ``samples``."""
+    """Return the least 2^k, 3·2^k, 5·2^k or 9·2^k that is not below ``samples``."""
     return min(
         factor << max((-(-samples // factor) - 1).bit_length(), 0) for factor in (1, 3, 5, 9)
     )
@@ -94,7 +94,7 @@ def _leaking_least(samples: int) -> FloatArray:
 
 
 def _fading(samples: int) -> FloatArray:
-    """Cosine-tapered (Tukey) window that rises and falls over ``_FADE`` of the samples each."""
+    """Return a Tukey window that rises and falls over ``_FADE`` of the samples each."""
     weights = np.ones(samples)
     length = _FADE * samples
     rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(int(length) + 1) / length)
@@ -106,7 +106,7 @@ def _fading(samples: int) -> FloatArray:
 def discretisation_error(
     dynamics: TransferFunction, digital: DigitalFilter, z: FloatArray, up_to: float
 ) -> tuple[float, float]:
-    """Root mean square and peak to valley of (H - G) z [m] within 0 … ``up_to`` [Hz]."""
+    """Return the root mean square and peak to valley of (H - G) z [m] within 0 … ``up_to`` [Hz]."""
     period = digital.sample_period
     frequency, velocity = velocity_spectrum(z, period, faded=True)
     band = (frequency > 0) & (frequency <= min(up_to, _RESOLVED_SHARE * 0.5 / period))
@@ -128,7 +128,7 @@ def discretisation_error(
 def audit(
     dynamics: TransferFunction, sample_period: float, z: FloatArray, up_to: float
 ) -> tuple[Audit, ...]:
-    """Every method judged on the motion ``z`` (n,) [m], the least error first."""
+    """Return every method judged on the motion ``z`` (n,) [m], the least error first."""
     filters: list[tuple[str, int | None, DigitalFilter]] = [
         (f"polynomial {order}", order, discretise(dynamics, sample_period, order))
         for order in ORDERS

@@ -20,18 +20,18 @@ class Spectrum:
     density: FloatArray
 
     def rms_between(self, low: float, high: float) -> float:
-        """rms of the content from ``low`` to ``high`` [Hz], in the signal's unit."""
+        """Return the rms of the content from ``low`` to ``high`` [Hz], in the signal's unit."""
         inside = (self.frequency >= low) & (self.frequency <= high)
         step = self.frequency[1] - self.frequency[0]
         return float(np.sqrt(np.sum(self.density[inside]) * step))
 
     def strongest(self) -> float:
-        """Frequency [Hz] of the greatest density above zero frequency."""
+        """Return the frequency [Hz] of the greatest density above zero frequency."""
         return float(self.frequency[1:][np.argmax(self.density[1:])])
 
 
 def power_spectrum(values: FloatArray, sample_period: float, segment: int = 1024) -> Spectrum:
-    """Welch's estimate of ``values`` (n,), the mean of each segment removed.
+    """Return Welch's estimate of ``values`` (n,), the mean of each segment removed.
 
     Raises DataError for fewer than eight samples or one that is not finite.
     """
@@ -62,7 +62,7 @@ class FrequencyResponse:
 def frequency_response(
     motion: FloatArray, seen: FloatArray, sample_period: float, segment: int
 ) -> FrequencyResponse:
-    """H1 = S_yu / S_uu by Welch's method with segments of ``segment`` samples, on increments.
+    """Return H1 = S_yu / S_uu by Welch's method, on increments, in segments of ``segment`` samples.
 
     Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
     that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.

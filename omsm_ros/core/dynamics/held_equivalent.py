@@ -65,7 +65,7 @@ def _without_equivalent(poles: ComplexArray) -> bool:
 
 
 def _fractions(b: FloatArray, a: FloatArray, poles: ComplexArray) -> tuple[float, ComplexArray]:
-    """d and r of H(z) = d + Σ r_i / (z - p_i)."""
+    """Return d and r of H(z) = d + Σ r_i / (z - p_i)."""
     descending, monic = b / a[0], a / a[0]
     direct = float(descending[0])
     rest = descending - direct * monic

@@ -82,7 +82,7 @@ class Latency:
             raise CalibrationError(f"certificate: {err}") from err
 
     def entry(self) -> dict[str, Any]:
-        """For ``certificate["latency"]``: JSON values."""
+        """Return the JSON values of ``certificate["latency"]``."""
         return asdict(self)
 
 

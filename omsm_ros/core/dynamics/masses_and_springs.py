@@ -65,11 +65,11 @@ class TwoMass:
         ]
 
     def non_collocated(self) -> TransferFunction:
-        """Eq. 7 scaled to G(0) = 1: the probe's mass, m2."""
+        """Return Eq. 7 scaled to G(0) = 1: the probe's mass, m2."""
         return TransferFunction.from_ascending([self.k2, self.c2], self._denominator()).normalised()
 
     def collocated(self) -> TransferFunction:
-        """The driven mass, m1, scaled to G(0) = 1."""
+        """Return the driven mass, m1, scaled to G(0) = 1."""
         numerator = [self.k2, self.c2, self.m2]
         return TransferFunction.from_ascending(numerator, self._denominator()).normalised()
 
@@ -94,7 +94,7 @@ def fit_two_mass(
     collocated: bool,
     frequencies: ArrayLike,
 ) -> TwoMassFit:
-    """Masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
+    """Return masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
 
     covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty; a delay
         among them is one more thing that the model has to explain
@@ -137,7 +137,7 @@ def fit_two_mass(
 def _least(
     residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]
 ) -> optimize.OptimizeResult:
-    """The least sum of squares; all ``starts`` race, and the best of them is followed."""
+    """Return the least sum of squares; all ``starts`` race, and the best of them is followed."""
 
     def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
         box = (start - _SEARCHED, start + _SEARCHED)
@@ -154,7 +154,7 @@ def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArr
 
 
 def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """W with Wᵀ W the inverse covariance of the response at all lines together, (k, k).
+    """Return W with Wᵀ W the inverse covariance of the response at all lines together, (k, k).
 
     The response of a few coefficients is the same statement many times over. What it cannot
     state at all, for it has no coefficient for it, counts ten times as much as its variance.
@@ -172,12 +172,12 @@ def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
-    """Frequencies of the conjugate pairs of poles [Hz], lowest first."""
+    """Return the frequencies of the conjugate pairs of poles [Hz], lowest first."""
     return tuple(mode.frequency for mode in dynamics.modes() if mode.damping < 1)
 
 
 def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:
-    """Uncoupled guesses with either mode belonging to the second mass."""
+    """Return the uncoupled guesses with either mode belonging to the second mass."""
     low, high = (2 * np.pi * frequency for frequency in oscillating[:2])
     starts = []
     for ratio in (0.05, 0.2, 0.8):
@@ -226,11 +226,11 @@ def shape(dynamics: TransferFunction, up_to: float) -> Shape:
 
 
 def finite_values(read: Shape) -> dict[str, float | None]:
-    """The fields of ``read`` as JSON values, None for NaN."""
+    """Return the fields of ``read`` as JSON values, None for NaN."""
     return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
 
 
 def _highest_peak(values: FloatArray) -> int | None:
-    """Its place, None where there is none; at an end there is no peak."""
+    """Return the index of the highest peak, None without one; an end is no peak."""
     peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
     return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -30,7 +30,7 @@ class ModalTerm:
 
 
 def modal_sum(terms: Sequence[ModalTerm], frequency: ArrayLike) -> ComplexArray:
-    """Response of Eq. 8 at ``frequency`` [Hz], of the same shape; not normalised."""
+    """Return the response of Eq. 8 at ``frequency`` [Hz], of the same shape; not normalised."""
     s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
     response = np.zeros_like(s)
     for term in terms:
@@ -56,14 +56,14 @@ class KnownMode:
     residue_uncertainty: float | None
 
     def term(self) -> ModalTerm | None:
-        """Its term of Eq. 8, None for a real pole."""
+        """Return its term of Eq. 8, None for a real pole."""
         if self.residue is None:
             return None
         return ModalTerm(self.residue, self.frequency, self.damping)
 
 
 def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[KnownMode, ...]:
-    """Modes of G, slowest first, with uncertainties linear in those of the coefficients.
+    """Return the modes of G, slowest first, with uncertainties linear in those of the coefficients.
 
     covariance: (p, p), order numerator, denominator[1:], delay
 
@@ -77,7 +77,7 @@ def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[Kno
 
 
 def mode_entries(dynamics: TransferFunction, covariance: FloatArray) -> list[dict[str, object]]:
-    """The modes as JSON values with their units, for a certificate; None for what is not finite."""
+    """Return the modes as JSON values with units, for a certificate; what is not finite as None."""
     return [
         {
             "frequency_hz": mode.frequency,
@@ -96,7 +96,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
-    """Greatest ``|G - Eq. 8|`` over greatest ``|G|``, below ``up_to`` [Hz]; a delay left out.
+    """Return max ``|G - Eq. 8|`` over max ``|G|`` below ``up_to`` [Hz], without the delay.
 
     What the terms do not say: real poles and the parts in s. None where nothing oscillates.
     """
@@ -128,7 +128,7 @@ def _known(dynamics: TransferFunction, pole: complex, covariance: FloatArray) ->
 
 
 def _pole_jacobian(dynamics: TransferFunction, pole: complex) -> ComplexArray:
-    """dp/d(numerator, denominator[1:], delay), (p,): from D(p) = 0, dp/dd_i = -p^i / D'(p)."""
+    """Return dp/d(numerator, denominator[1:], delay), (p,); dp/dd_i = -p^i / D'(p), as D(p) = 0."""
     powers = np.arange(1, len(dynamics.denominator))
     slope = polynomial.polyval(pole, polynomial.polyder(dynamics.denominator))
     zeros = np.zeros(len(dynamics.numerator))
@@ -138,7 +138,7 @@ def _pole_jacobian(dynamics: TransferFunction, pole: complex) -> ComplexArray:
 def _residue(
     dynamics: TransferFunction, pole: complex, moved: ComplexArray
 ) -> tuple[float, FloatArray]:
-    """Residue of Eq. 8 and its derivative by the coefficients, (p,).
+    """Return the residue of Eq. 8 and its derivative by the coefficients, (p,).
 
     The partial fractions ``r/(s-p) + r*/(s-p*)``, r = N(p) / (N(0) D'(p)), have the value
     ``-2 Re(r p*) / |p|²`` at s = 0; the term of Eq. 8 with that value has -2 Re(r p*).

@@ -40,7 +40,7 @@ class _StateSpace(NamedTuple):
 def held_zeros(
     zeros: ComplexArray, poles: ComplexArray, order: int, at_rest: int = 0
 ) -> ComplexArray:
-    """Zeros in the z plane of the system with these roots, in radians a sample.
+    """Return the zeros in the z plane of the system with these roots, in radians a sample.
 
     at_rest: zeros at s = 0, which the interpolation maps to z = 1 exactly if it reproduces
         polynomials of that degree; among eigenvalues that coincide they would be blurred
@@ -79,7 +79,7 @@ def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
 
 
 def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
-    """Sections in series; the gain is arbitrary."""
+    """Return the sections in series; the gain is arbitrary."""
     whole = _StateSpace(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
     for numerator, denominator in _sections(zeros, poles):
         part = _section(numerator, denominator)
@@ -94,7 +94,7 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
 
 
 def _sections(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Proper ratios of real polynomials, ascending and monic, of second order but for one."""
+    """Return proper ratios of real, monic, ascending polynomials, of second order but for one."""
     denominators = [*_quadratics(_pairs(poles)), *_by_two(_reals(poles))]
     pairs, reals = _quadratics(_pairs(zeros)), _reals(zeros)
     numerators = []
@@ -131,7 +131,7 @@ def _expanded(roots: FloatArray) -> FloatArray:
 
 
 def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
-    """A ratio of first or second order, its states y and y'/ω, its output of a size near 1."""
+    """Return a ratio of first or second order with states y and y'/ω and an output near 1."""
     n = len(denominator) - 1
     omega = abs(denominator[0]) ** (1 / n)
     powers = omega ** np.arange(n + 1)
@@ -147,7 +147,7 @@ def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
 
 
 def _held_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1] … in the step from k-1 to k."""
+    """Return exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1], … from k-1 to k."""
     n = len(a)
     # Driving states by a chain of integrators makes one exponential hold ∫ e^{a(1-v)} b v^j/j! dv.
     chain = np.zeros((n + order + 1, n + order + 1))

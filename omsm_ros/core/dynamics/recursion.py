@@ -20,7 +20,7 @@ POLYNOMIAL_DEGREE = 2
 
 
 def past_motion(first: FloatArray) -> FloatArray:
-    """Ascending coefficients (3,) of the parabola through ``first`` (k,), k >= 3, over its index.
+    """Fit a parabola to ``first`` (k,), k >= 3, over its index: ascending coefficients (3,).
 
     Least squares about the middle sample, where the fit is best conditioned, then shifted.
     """
@@ -70,7 +70,7 @@ class Recursion:
             motion = out
 
     def run(self, samples: FloatArray, out: FloatArray | None = None) -> FloatArray:
-        """Response to ``samples`` (n,), shape (n,); bit-identical however the stream is cut.
+        """Return the response (n,) to ``samples`` (n,), bit-identical however the stream is cut.
 
         out: where it is written, see :func:`omsm_ros.scipy_parts.sosfilt`
         """
@@ -78,7 +78,7 @@ class Recursion:
 
 
 def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
-    """Coefficients of the response of a section (6,) to an everlasting polynomial ``motion``."""
+    """Return the polynomial with which a section (6,) answers an everlasting one, ``motion``."""
     degree = len(motion)
     # q(k) -> q(k - 1) is a triangular matrix acting on the coefficients of q.
     shift = np.array(

@@ -35,7 +35,7 @@ class Band:
 
 
 def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray) -> FloatArray:
-    """d(ln|G|, arg G)/d(numerator, denominator[1:], delay), shape (2, k, p).
+    """Return d(ln|G|, arg G)/d(numerator, denominator[1:], delay), shape (2, k, p).
 
     frequency: (k,) [Hz]
     """
@@ -50,7 +50,7 @@ def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray
 def response_band(
     dynamics: TransferFunction, covariance: FloatArray, frequency: FloatArray
 ) -> Band:
-    """Standard uncertainty of gain and phase from the covariance of the coefficients (p, p)."""
+    """Return the standard uncertainty of gain and phase from the ``covariance`` (p, p) of G."""
     jacobian = relative_response_jacobian(dynamics, frequency)
     variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
     gain, phase = np.sqrt(np.maximum(variance, 0.0))
@@ -74,7 +74,7 @@ def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: Floa
 
 
 def widening(band: Band, other: Band, apart: ComplexArray) -> float:
-    """Least factor, not below 1, by which ``band`` has to grow to hold the whole of ``other``.
+    """Return the least factor, at least 1, by which ``band`` must grow to hold all of ``other``.
 
     apart: ln of the other's response over that of ``band``, at the same frequencies (k,)
     """
@@ -87,7 +87,7 @@ def widening(band: Band, other: Band, apart: ComplexArray) -> float:
 
 
 def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None) -> float:
-    """Highest frequency [Hz] below which the 95 % band stays inside ``limits``; 0 if nowhere.
+    """Return the frequency [Hz] up to which the 95 % band stays inside ``limits``; 0 if nowhere.
 
     other: further error at the same frequencies, added to the half-width, or None
     """
@@ -103,7 +103,7 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
 def shown_up_to(
     frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
 ) -> float:
-    """Highest frequency [Hz] at which the data alone would show a response off by ``limits``.
+    """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
 
     frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
     noise: mean square of the transform of the probe's noise, (k,)

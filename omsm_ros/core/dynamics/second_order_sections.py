@@ -64,5 +64,5 @@ def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
 
 
 def _monic(pair: tuple[complex, complex]) -> list[float]:
-    """Coefficients of (1 - r/z)(1 - s/z), ascending in 1/z."""
+    """Return the coefficients of (1 - r/z)(1 - s/z), ascending in 1/z."""
     return [1.0, float(np.real(-pair[0] - pair[1])), float(np.real(pair[0] * pair[1]))]

@@ -9,7 +9,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 
 def slow_motion_jacobian(dynamics: TransferFunction) -> FloatArray:
-    """d(L, k)/d(numerator, denominator[1:], delay), shape (2, p) [s, s²].
+    """Return d(L, k)/d(numerator, denominator[1:], delay), shape (2, p) [s, s²].
 
     With ``∂ln G/∂n_i = s^i/N`` and ``∂ln G/∂d_i = -s^i/D``, cut after s².
     """
@@ -23,11 +23,11 @@ def slow_motion_jacobian(dynamics: TransferFunction) -> FloatArray:
 
 
 def _inverse_series(polynomial: FloatArray) -> FloatArray:
-    """1/polynomial to s², (3,)."""
+    """Return 1/polynomial to s², (3,)."""
     n0, n1, n2 = np.append(polynomial, np.zeros(2))[:3]
     return np.array([1.0 / n0, -n1 / n0**2, n1**2 / n0**3 - n2 / n0**2], np.float64)
 
 
 def _shifted(series: FloatArray, powers: int) -> FloatArray:
-    """Times s to the ``powers``, to s²."""
+    """Return the times s to the ``powers``, to s²."""
     return np.asarray(np.append(np.zeros(powers), series)[:3], np.float64)

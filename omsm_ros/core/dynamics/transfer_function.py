@@ -81,26 +81,26 @@ class TransferFunction:
         return float(self.delay + den[1] - num[1] / num[0])
 
     def normalised(self) -> TransferFunction:
-        """The same dynamics with G(0) = 1."""
+        """Return the same dynamics with G(0) = 1."""
         if self.dc_gain == 0:
             raise DataError("a transfer function with G(0) = 0 cannot be normalised")
         return TransferFunction(self.numerator / self.dc_gain, self.denominator, self.delay)
 
     def response(self, frequency: ArrayLike) -> ComplexArray:
-        """G(2πjf) at ``frequency`` [Hz], of the same shape."""
+        """Return G(2πjf) at ``frequency`` [Hz], of the same shape."""
         return self.at(np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128))
 
     def at(self, s: ComplexArray) -> ComplexArray:
-        """G at complex ``s`` [rad/s], of the same shape."""
+        """Return G at complex ``s`` [rad/s], of the same shape."""
         ratio = polynomial.polyval(s, self.numerator) / polynomial.polyval(s, self.denominator)
         return np.asarray(ratio * np.exp(-self.delay * s), np.complex128)
 
     def poles(self) -> ComplexArray:
-        """Roots of the denominator [rad/s], shape (n,)."""
+        """Return the roots of the denominator [rad/s], shape (n,)."""
         return ascending_roots(self.denominator)
 
     def zeros(self) -> ComplexArray:
-        """Roots of the numerator [rad/s], shape (m,)."""
+        """Return the roots of the numerator [rad/s], shape (m,)."""
         return ascending_roots(self.numerator)
 
     @property
@@ -109,14 +109,14 @@ class TransferFunction:
         return bool(np.all(self.poles().real < 0))
 
     def modes(self) -> tuple[Mode, ...]:
-        """Poles as frequency and damping, slowest first; a conjugate pair counts once."""
+        """Return poles as frequency and damping, slowest first; a conjugate pair counts once."""
         upper = [p for p in self.poles() if p.imag >= 0]
         modes = [Mode(float(abs(p) / (2 * np.pi)), float(-p.real / abs(p))) for p in upper]
         return tuple(sorted(modes, key=lambda mode: mode.frequency))
 
 
 def ascending_roots(coefficients: FloatArray) -> ComplexArray:
-    """Roots of a polynomial in ascending powers, trailing zeros ignored.
+    """Return the roots of a polynomial in ascending powers, trailing zeros ignored.
 
     The coefficients of a transfer function in s span ten or more decades, so the
     variable is scaled to bring the roots near 1 before the companion matrix is solved.

@@ -100,7 +100,7 @@ def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
 
 
 def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
-    """Variance spectrum of what ``passed`` makes of the noise of the motion, as far as it moves."""
+    """Return the spectrum of what ``passed`` makes of the motion's noise, where there is motion."""
     frequency = fft.rfftfreq(length, problem.period)
     moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
     power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2

@@ -50,13 +50,13 @@ class DiscreteStarts:
         return np.asarray(np.interp(index, index[self.used], self.output[self.used]))
 
     def _rows(self, order: int) -> BoolArray:
-        """True where the sample and ``order`` before it are all used, shape (n - order,)."""
+        """Return True where the sample and ``order`` before it are all used, shape (n - order,)."""
         return np.asarray(np.all(sliding_window_view(self.used, order + 1), axis=1))
 
     def _regressors(
         self, u: FloatArray, y: FloatArray, order: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Columns -y[k-1] … -y[k-n], u[k] … u[k-n], 1 and the target y[k], where all are used."""
+        """Return columns -y[k-1] … -y[k-n], u[k] … u[k-n], 1 and target y[k], if all are used."""
         rows = self._rows(order)
         past = sliding_window_view(y, order + 1)[rows][:, ::-1]
         drive = sliding_window_view(u, order + 1)[rows][:, ::-1]
@@ -67,7 +67,7 @@ class DiscreteStarts:
         return _poles(least_squares(columns, target)[:order])
 
     def _iterated(self, order: int) -> list[ComplexArray]:
-        """By instruments, then by Steiglitz and McBride's iteration, from the ARX model."""
+        """Return poles by instrumental variables, then by Steiglitz and McBride's iteration."""
         columns, target = self._regressors(self.input, self._filled, order)
         found = least_squares(columns, target)
         try:
@@ -120,13 +120,13 @@ class DiscreteStarts:
 
 
 def _poles(coefficients: FloatArray) -> ComplexArray:
-    """Poles in z of 1 + a1 q + … + an q^n."""
+    """Return the poles in z of 1 + a1 q + … + an q^n."""
     if not np.all(np.isfinite(coefficients)):
         return np.empty(0, np.complex128)
     return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
 
 
 def _inside(poles: ComplexArray) -> ComplexArray:
-    """``poles`` with those outside the unit circle reflected into it."""
+    """Return ``poles`` with those outside the unit circle reflected into it."""
     outside = np.abs(poles) > 1
     return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)

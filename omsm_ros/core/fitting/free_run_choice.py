@@ -123,7 +123,7 @@ def choose_sampled(
 
 
 def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
-    """The candidate at the best minimum that starts from all used samples lead to."""
+    """Return the candidate at the best minimum that starts from all used samples lead to."""
     if candidate.order == 0 or candidate.whitened:
         return candidate
     every = [candidate.fit.nonlinear, *_proposed(candidate.problem, candidate.order, starts)]
@@ -131,7 +131,7 @@ def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCan
 
 
 def _proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
-    """ψ of what ``starts`` propose for ``order``, as far as they are any."""
+    """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
     scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
     proposed = [scaled.of_discrete(poles) for poles in starts.poles(order)]
     return [p for p in proposed if len(p) == order and np.all(np.isfinite(p))]
@@ -155,7 +155,7 @@ def _highest_order(samples: int, order: int) -> int:
 
 
 def _parts(used: BoolArray) -> FloatArray:
-    """Number of the part, 0 to _PARTS, a used sample is in, with fractions; -1 elsewhere."""
+    """Return in which part, 0 to _PARTS, each used sample lies, with fractions; -1 elsewhere."""
     place = np.cumsum(used) - 1.0
     return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
 
@@ -177,7 +177,7 @@ def _delayed(
 def _best_delay(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, most: int
 ) -> int:
-    """Whole samples by which a small model is best late."""
+    """Return the whole samples by which a small model is best late."""
     if most == 0:
         return 0
     same = used & (np.arange(len(used)) >= most)
@@ -195,7 +195,7 @@ def _best_delay(
 def _explored(
     early: HeldProblem, late: BoolArray, most: int, at_least: int
 ) -> tuple[list[Fit], FloatArray]:
-    """Fits of rising order, and how they predict ``late``; until some in a row predict no better.
+    """Return fits of rising order and their errors over ``late``; stop when some predict no better.
 
     at_least: order to go to in any case
     """
@@ -211,7 +211,7 @@ def _explored(
 
 
 def _next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
-    """Best fit with as many poles as there are ``smaller`` fits, from none on."""
+    """Fit as many poles as there are ``smaller`` fits, and return the best."""
     order = len(smaller)
     structure = Structure(order, order, False)
     if order == 0:
@@ -221,7 +221,7 @@ def _next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteSt
 
 
 def _grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
-    """Starts for one pole more than the last of ``smaller``.
+    """Return the starts for one pole more than the last of ``smaller``.
 
     A pole too fast to matter, so that a larger model never fits worse; and two as slow as the
     record is long: descent alone does not reach a pair of integrators from other starts.
@@ -232,7 +232,7 @@ def _grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
 
 
 def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
-    """ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
+    """Return ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
     pairs, odd = divmod(len(nonlinear), 2)
     first, second = nonlinear[:pairs], nonlinear[pairs + odd :]
     if not odd:
@@ -242,7 +242,7 @@ def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
 
 
 def _refitted(problem: HeldProblem, start: Fit, whitened: bool) -> Fit:
-    """The structure of ``start`` fitted to ``problem``, its residual made white if wanted."""
+    """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``."""
     found = fit(problem, start.structure, [start.nonlinear])
     if not whitened:
         return found
@@ -261,21 +261,21 @@ def _refitted(problem: HeldProblem, start: Fit, whitened: bool) -> Fit:
 
 
 def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
-    """Mean square error of a free run over samples that are not used in ``problem``."""
+    """Return the mean square error of a free run over samples that are not used in ``problem``."""
     missed = (problem.output - problem.free_run(fitted))[hidden]
     value = float(np.mean(missed**2))
     return value if np.isfinite(value) else np.inf
 
 
 def _finalists(by_order: FloatArray, order: int) -> list[int]:
-    """Orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
+    """Return the orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
     best = np.argsort(by_order, kind="stable")[:_FINALISTS]
     about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))[:_FINALISTS]
     return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
 
 
 def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
-    """Mean square error over each hidden part, the candidate fitted without it.
+    """Return the mean square error over each hidden part, the candidate fitted without it.
 
     Some parts lie inside the record and one at its end. Inside alone would misjudge a plant that
     drifts, because the data hold the model at both ends. No model has to run backwards.

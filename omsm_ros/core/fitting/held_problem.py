@@ -35,7 +35,7 @@ class DiscreteScaled(Scaled):
     """Sections in w of a denominator in q; numerators are polynomials in q."""
 
     def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """1 / denominator (k,), and d ln of it / dψ (len ψ, k), at q = ``s`` (k,)."""
+        """Return L = 1 / denominator (k,) and d ln L / dψ (len ψ, k) at q = ``s`` (k,)."""
         up, down = 1 + s, _PER_BILINEAR * (1 - s)
         denominator = np.ones_like(s)
         first, second = [], []
@@ -54,7 +54,7 @@ class DiscreteScaled(Scaled):
         return 1 / denominator, relative.reshape(-1, len(s))
 
     def polynomials(self, nonlinear: FloatArray) -> list[FloatArray]:
-        """Factors of the denominator, ascending in q."""
+        """Return the factors of the denominator, ascending in q."""
         up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
         found = []
         for section in self.sections(nonlinear):
@@ -111,7 +111,7 @@ class HeldProblem(Problem):
         return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles + 1)]
 
     def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
-        """Without their mean, which the offset replaces: an integrator's would drown the rest."""
+        """Return columns without their mean: the offset stands for it; an integrator's is vast."""
         spectra = super()._driven(structure, lag)
         spectra[:, 0] = 0.0
         return spectra
@@ -172,7 +172,7 @@ def _product(factors: list[FloatArray]) -> FloatArray:
 def _changes(
     scaled: DiscreteScaled, nonlinear: FloatArray, factors: list[FloatArray]
 ) -> list[FloatArray]:
-    """Derivatives of the product of ``factors`` by each of ψ, ascending in q."""
+    """Return the derivatives of the product of ``factors`` by each of ψ, ascending in q."""
     up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
     first, second = [], []
     for place, section in enumerate(scaled.sections(nonlinear)):

@@ -38,7 +38,7 @@ class Structure:
         return self.poles // 2
 
     def contains(self, other: Structure) -> bool:
-        """True if ``other`` is a smaller special case of this one."""
+        """Return True if ``other`` is a smaller special case of this one."""
         return (
             other.size < self.size
             and other.poles <= self.poles
@@ -47,7 +47,7 @@ class Structure:
         )
 
     def label(self) -> str:
-        """For a reader: ``2 zeros, 3 poles, delay``."""
+        """Return the structure in words: ``2 zeros, 3 poles, delay``."""
         return f"{self.zeros} zeros, {self.poles} poles{', delay' if self.delay else ''}"
 
 
@@ -68,7 +68,7 @@ class Scaled:
         return self.structure.poles + self.structure.delay
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Box of ψ: any pole from far below to far above ``rate``; delay ≥ 0."""
+        """Return the box of ψ: any pole from far below to far above ``rate``; delay ≥ 0."""
         lower = np.full(self.nonlinear_size, -_LOG_RANGE)
         upper = np.full(self.nonlinear_size, _LOG_RANGE)
         if self.structure.delay:
@@ -76,7 +76,7 @@ class Scaled:
         return lower, upper
 
     def sections(self, nonlinear: FloatArray) -> list[FloatArray]:
-        """Ascending factors of the denominator, [1, d1, d2] for a pair or [1, d1]."""
+        """Return the ascending factors of the denominator, [1, d1, d2] for a pair or [1, d1]."""
         alpha, beta = self._logs(nonlinear)
         return [
             np.exp(np.concatenate([np.zeros(1), alpha[i : i + 1], beta[i : i + 1]]))
@@ -91,7 +91,7 @@ class Scaled:
         return float(nonlinear[-1]) if self.structure.delay else 0.0
 
     def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """e^{-τs} / denominator (k,), and d ln of it / dψ (len ψ, k), at scaled ``s`` (k,)."""
+        """Return L = e^{-τs} / denominator (k,) and d ln L / dψ (len ψ, k) at scaled ``s`` (k,)."""
         denominator = np.ones_like(s)
         first, second = [], []
         for section in self.sections(nonlinear):
@@ -107,7 +107,7 @@ class Scaled:
         return np.exp(-self._delay(nonlinear) * s) / denominator, relative.reshape(-1, len(s))
 
     def transfer_function(self, nonlinear: FloatArray, numerator: FloatArray) -> TransferFunction:
-        """G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
+        """Return G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
         denominator: FloatArray = np.ones(1)
         for section in self.sections(nonlinear):
             denominator = np.asarray(polynomial.polymul(denominator, section), np.float64)
@@ -118,7 +118,7 @@ class Scaled:
         )
 
     def coefficient_jacobian(self, nonlinear: FloatArray) -> FloatArray:
-        """d(numerator, denominator[1:], delay)/d(numerator[1:], ψ), SI over scaled.
+        """Return d(numerator, denominator[1:], delay)/d(numerator[1:], ψ), SI over scaled.
 
         Shape (m+1 + n + 1, m + len ψ); the row of numerator[0] = 1 is zero.
         """
@@ -139,7 +139,7 @@ class Scaled:
         return self.rate ** -powers[:, np.newaxis] * jacobian
 
     def nonlinear_of(self, poles: ComplexArray, delay: float) -> FloatArray:
-        """ψ of given stable scaled ``poles`` (n,), conjugates included, and ``delay``."""
+        """Return ψ of given stable scaled ``poles`` (n,), conjugates included, and ``delay``."""
         sections = [(-2 * p.real / abs(p) ** 2, abs(p) ** -2) for p in poles if p.imag > 0]
         real = sorted((p.real for p in poles if p.imag == 0), key=abs)
         while len(real) >= 2:

@@ -97,7 +97,7 @@ def _promising(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     colour: float,
 ) -> list[Structure]:
-    """The structures with ``poles`` that may yet win.
+    """Return the structures with ``poles`` that may yet win.
 
     The largest contains them all: what it cannot gain none of them can, so it is fitted
     first and added to ``found``, unless there are so few poles that all are of interest.

@@ -134,7 +134,7 @@ class Problem:
         return np.asarray(np.take(back, self._places, axis=-1), np.float64)
 
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
-        """Residual at one ψ after the linear parameters are eliminated."""
+        """Return the residual at one ψ after the linear parameters are eliminated."""
         lag, relative = scaled.lag(nonlinear, self.s)
         driven = self._driven(scaled.structure, lag)
         # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
@@ -150,7 +150,7 @@ class Problem:
         return Projection(nonlinear, residual, linear, derivative)
 
     def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
-        """Spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
+        """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
         terms = [
             self.s ** np.arange(count)[:, np.newaxis] * (lag * spectrum)
             for spectrum, count in self.drives(structure)
@@ -169,20 +169,20 @@ class Problem:
         return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
 
     def moved(self, fitted: Fit) -> ComplexArray:
-        """Spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
+        """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
         return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
 
     def modelled(self, fitted: Fit) -> FloatArray:
-        """What the fitted model says is seen, at every sample, (n,)."""
+        """Return the output (n,) of the fitted model at every sample."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         spectrum = fitted.driven @ self._driven(fitted.structure, lag)
         moved = fft.irfft(spectrum, self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
-        """d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
+        """Return d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
         lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
@@ -193,7 +193,7 @@ class Problem:
         return np.column_stack([self._in_time(every).T, self._fixed])
 
     def bent(self, fitted: Fit) -> FloatArray:
-        """d output / d(gain, lag, curvature, further drives, background) of the response, (k, …).
+        """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
 
         That is by coefficients of 1, s and s² in front of it: any response bends like that.
         """
@@ -299,7 +299,7 @@ def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) ->
 
 
 def _descend(problem: Problem, scaled: Scaled, start: Projection, evaluations: int) -> Projection:
-    """Levenberg and Marquardt's way downhill inside the box, damped after Nielsen (1999).
+    """Minimise inside the box by Levenberg and Marquardt's method, damped after Nielsen (1999).
 
     On normal equations: a handful of parameters against many samples, whose scale is taken
     out. A general solver factorises the whole jacobian at each step, and takes ten times as long.

@@ -20,7 +20,7 @@ _SMOOTHING_BINS = 101
 
 
 def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
+    """Return ``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
 
     On the way back it rests, until nothing rings when the record starts anew.
     """
@@ -32,7 +32,7 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
 
 
 def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
-    """The part of a motion's ``spectrum`` (k,) that is motion, up to its last such frequency.
+    """Return what is motion in its ``spectrum`` (k,), up to the last frequency that has any.
 
     Wiener's filter. Where an encoder shows only its noise, the probe saw nothing of it;
     a fit that took it for motion would be paid for a response that vanishes there.

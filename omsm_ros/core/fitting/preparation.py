@@ -70,14 +70,14 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
-    """The problem with what the steps of the probe's readings leave open on plateaus."""
+    """Return the problem with what the steps of the probe's readings leave open on plateaus."""
     plateau, seen = plateaus(steps, problem.used), problem.output[problem.used]
     shared = plateau_variance(seen, plateau[problem.used], reading_step(seen))
     return replace(problem, plateau=plateau, shared=shared)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:
-    """The motion (n,) that is the input, finite everywhere."""
+    """Return the motion (n,) that is the input, finite everywhere."""
     if source == "encoder":
         return record.z
     if source != "reference":
@@ -119,7 +119,7 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
 
 
 def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
-    """``motion`` (n,), where it starts or ends moving faded to its mean there.
+    """Return ``motion`` (n,), where it starts or ends moving faded to its mean there.
 
     A motion that breaks off would have content at all frequencies, where there was none.
     """
@@ -140,7 +140,7 @@ def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> F
 
 
 def _after_loss(record: MotionRecord) -> BoolArray:
-    """True where the response still remembers a motion that was lost, shape (n,)."""
+    """Return True where the response still remembers a motion that was lost, shape (n,)."""
     samples = len(record)
     if record.z_lost is None:
         return np.zeros(samples, np.bool_)
@@ -150,7 +150,7 @@ def _after_loss(record: MotionRecord) -> BoolArray:
 
 
 def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
-    """The steps without those edges of which a part was lost."""
+    """Return the steps without those edges of which a part was lost."""
     if record.z_lost is None:
         return steps
     lost = record.z_lost
@@ -159,7 +159,7 @@ def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
 
 
 def content_frequency(motion: FloatArray, sample_period: float) -> float:
-    """Frequency [Hz] below which 99 % of the velocity's energy lies."""
+    """Return the frequency [Hz] below which 99 % of the velocity's energy lies."""
     power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
     # Compared without a division: of no motion, or of one too small to square, all is at rest.
     place = int(np.searchsorted(np.cumsum(power), 0.99 * np.sum(power))) + 1

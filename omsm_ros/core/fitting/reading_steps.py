@@ -31,7 +31,7 @@ def reading_step(readings: FloatArray) -> float:
 
 
 def plateaus(steps: Steps, used: BoolArray) -> IntArray:
-    """Number of the plateau that a sample belongs to, (n,); -1 where the axis moves."""
+    """Return the number of the plateau that a sample belongs to, (n,); -1 where the axis moves."""
     if not steps.edges:
         return np.full(len(used), -1)
     begun = np.diff(steps.moving.astype(np.int8), prepend=1) == -1
@@ -39,7 +39,7 @@ def plateaus(steps: Steps, used: BoolArray) -> IntArray:
 
 
 def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> float:
-    """Variance [m²] of the error of rounding that all readings of a plateau share.
+    """Return the variance [m²] of the error of rounding that all readings of a plateau share.
 
     The error is periodic in the position; noise σ weakens its first harmonic, q/π, as
     exp(-2π²σ²/q²) (Widrow and Kollár 2008, ch. 19). readings: (k,), plateau: (k,)

@@ -62,7 +62,7 @@ class StartingPoints:
         return problem.closed_spectrum(np.asarray(filled))
 
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:
-        """Poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
+        """Return the poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
         # At s = 0 only the background is decided; there, and at the end, s may be extreme.
         inside = slice(1, max(len(self.problem.s) - 1, 2))
         s, probe = self.problem.s[inside, np.newaxis], self._probe[inside]
@@ -98,7 +98,7 @@ def _guess(scaled: Scaled, delay: float) -> FloatArray:
 
 
 def _stable(poles: ComplexArray) -> ComplexArray:
-    """Poles in conjugate pairs, reflected to the left half plane and kept off its border."""
+    """Return poles in conjugate pairs, reflected to the left half plane and kept off its border."""
     finite = poles[np.isfinite(poles)]
     upper = finite[finite.imag > 1e-9 * np.abs(finite)]
     real = finite[np.abs(finite.imag) <= 1e-9 * np.abs(finite)].real
@@ -108,7 +108,7 @@ def _stable(poles: ComplexArray) -> ComplexArray:
 
 
 def _grown(scaled: Scaled, fit: Fit, delay: float) -> FloatArray:
-    """The smaller fit with fast poles added; their zeros follow linearly."""
+    """Return the smaller fit with fast poles added; their zeros follow linearly."""
     added = _ADDED_POLE * 1.5 ** np.arange(scaled.structure.poles - fit.structure.poles)
     own = _stable(fit.dynamics.poles() / scaled.rate)
     tail = float(fit.nonlinear[-1]) if fit.structure.delay else 0.02 * delay

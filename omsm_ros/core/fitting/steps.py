@@ -70,7 +70,7 @@ def _difference_noise(values: FloatArray, order: int) -> float:
 
 
 def find_steps(z: FloatArray, sample_period: float) -> Steps:
-    """Edges of ``z`` (n,) [m] sampled every ``sample_period`` [s].
+    """Return the edges of ``z`` (n,) [m] sampled every ``sample_period`` [s].
 
     Raises StepTestError when the axis does not move, or moves farther than any probe sees.
     """
@@ -95,7 +95,7 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
 
 
 def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
-    """True where z leaves its value by more than ``threshold`` within a rest's duration."""
+    """Return True where z leaves its value by more than ``threshold`` within a rest's duration."""
     width = min(max(round(_REST_S / sample_period), 2), len(z) - 1)
     changes = np.abs(z[width:] - z[:-width]) > threshold
     # A change between k and k + width lies anywhere between: close the window over it.

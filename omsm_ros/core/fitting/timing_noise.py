@@ -22,7 +22,7 @@ _SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
 
 
 def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
-    """Variance [s²] of the time of a reading, from a residual; 0 where it does not show.
+    """Return the variance [s²] of the time of a reading, from a residual; 0 where it does not show.
 
     on_grid: residual (n,) [m], NaN where nothing is compared;  rate: of the motion (n,) [m/s]
     """
@@ -44,7 +44,7 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
 
 
 def _lasts(on_grid: FloatArray, rate: FloatArray) -> bool:
-    """True if neighbours in ``on_grid`` resemble each other where the axis moves."""
+    """Return True if neighbours in ``on_grid`` resemble each other where the axis moves."""
     moving = rate**2 > _STILL * np.max(rate**2)
     value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
     product = value[1:] * value[:-1]

@@ -34,7 +34,7 @@ def rate_of(problem: Problem) -> FloatArray:
 
 
 def _rounded(problem: Problem, columns: FloatArray) -> FloatArray:
-    """The readings of a plateau share one error, and each moving one has its own.
+    """Return rows of rounding errors: one a plateau, whose readings share it, one a moving reading.
 
     The noise at rest does not show the latter.
     """

@@ -112,7 +112,7 @@ def _response_entries(evidence: Evidence) -> dict[str, object]:
 
 
 def _gain_entries(evidence: Evidence) -> dict[str, object]:
-    """What is seen beside the response: gain and drift."""
+    """Return what the fit finds beside the response: gain and drift."""
     best = evidence.fit
     duration = len(evidence.record) * evidence.record.sample_period
     return {
@@ -125,7 +125,7 @@ def _gain_entries(evidence: Evidence) -> dict[str, object]:
 
 
 def _attributed(record: MotionRecord) -> dict[str, object] | None:
-    """Gains between probe, encoder and reference; None where there are too few plateaus."""
+    """Return gains between probe, encoder and reference; None where there are too few plateaus."""
     try:
         return asdict(static_gains(record))
     except StepTestError:

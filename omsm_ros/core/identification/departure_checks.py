@@ -103,7 +103,7 @@ def _entry(term: Term, size: float | None, uncertainty: float | None) -> dict[st
 
 
 def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[tuple[float, float]]:
-    """Size of each modelled term and its standard uncertainty [m]."""
+    """Return the size of each modelled term and its standard uncertainty [m]."""
     if not beside:
         return []
     columns = problem.sensitivity(fit)

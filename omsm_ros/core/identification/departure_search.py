@@ -118,7 +118,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
 
 
 def _drift(prepared: Prepared) -> list[Judged]:
-    """Drift, if it shows before any model does: a model would take it for a slow pole."""
+    """Return drift, if it shows before any model does: a model would take it for a slow pole."""
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     survey = Survey(problem, lag, prepared.steps, (CREEP, DRIFT))
@@ -128,7 +128,7 @@ def _drift(prepared: Prepared) -> list[Judged]:
 
 
 def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
-    """Departures that the poles of ``model`` imitate: a plain one beside them describes more.
+    """Return departures that poles of ``model`` imitate: beside them a plain model describes more.
 
     What is not linear is not bent into poles where fewer of them and its own columns do better.
     """
@@ -150,7 +150,7 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
 
 
 def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
-    """Those to be fitted in the background now: the clearest, and its equals among the slow."""
+    """Return those to fit in the background now: the clearest, and its equals among the slow."""
     if not shown:
         return []
     first = shown[0]
@@ -182,7 +182,7 @@ def _with_columns(
 def _renewed(
     prepared: Prepared, survey: Survey, beside: Sequence[ModelledTerm], families: set[str]
 ) -> tuple[Prepared, list[ModelledTerm]]:
-    """The problem with the columns of ``families`` as the fit of ``survey`` has them."""
+    """Return the problem with the columns of ``families`` as the fit of ``survey`` has them."""
     background, renewed = prepared.problem.background.copy(), []
     for modelled in beside:
         term = modelled.term
@@ -194,7 +194,7 @@ def _renewed(
 
 
 def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Model] | None:
-    """The model with the poles of ``term``, or None where that describes nothing better."""
+    """Return the model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
         return None
     problem = prepared.problem
@@ -237,6 +237,6 @@ def _poles(term: Term) -> ComplexArray:
 
 
 def _decays(found: Fit, problem: Problem) -> bool:
-    """True if every pole of ``found`` forgets within the record."""
+    """Return True if every pole of ``found`` forgets within the record."""
     slowest = float(np.min(-found.dynamics.poles().real))
     return slowest * len(problem.input) * problem.period > _LEAST_DECAYS

@@ -74,7 +74,7 @@ def _measured(
 
 
 def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
-    """Correlation of ``residual`` (n,), NaN left out, with itself 1 to ``lags`` samples later."""
+    """Return the correlation of ``residual`` (n,), without NaN, with itself 1 to ``lags`` later."""
     known = np.isfinite(residual)
     values = np.where(known, residual, 0.0)
     power = float(np.sum(values**2)) / max(int(np.sum(known)), 1)

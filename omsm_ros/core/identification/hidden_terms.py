@@ -80,7 +80,7 @@ class HiddenTerm:
         return float(np.hypot(self.size, self.uncertainty))
 
     def covariance(self, carried: float) -> FloatArray:
-        """(p, p), of the coefficients, for a standard uncertainty ``carried`` of the size."""
+        """Return the coefficients' covariance (p, p) for a size known to ``carried``."""
         rows = carried * np.stack([self.shift, self.above * self.gain])
         return np.asarray(rows.T @ rows)
 
@@ -96,11 +96,13 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
     if drift:
         other = without_drift(survey, drift).creep
         relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
-    told = [term for term in relaxations if np.isfinite(term.uncertainty)]
-    found = [_worst(told, relaxation_found(survey.fitted.dynamics))] if told else []
+    known = [term for term in relaxations if np.isfinite(term.uncertainty)]
+    found = [_worst(known, relaxation_found(survey.fitted.dynamics))] if known else []
     for name in _BENDING:
         judged = survey.best.get(name)
-        if judged is not None and np.isfinite(judged.score.uncertainty) and _told(survey, judged):
+        if judged is None or not np.isfinite(judged.score.uncertainty):
+            continue
+        if _excited(survey, judged):
             found.append(_hidden(survey, judged))
     return found
 
@@ -126,7 +128,7 @@ def without_drift(survey: Survey, drift: Sequence[slice]) -> Survey:
 
 
 def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
-    """The relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
+    """Return the relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
     size, uncertainty = float(other.score.size[0]), other.score.uncertainty
     if not np.hypot(size, uncertainty) < term.carried:
         return term
@@ -154,7 +156,7 @@ def _worst(relaxations: list[HiddenTerm], found: float) -> HiddenTerm:
 
 
 def relaxation_found(dynamics: TransferFunction) -> float:
-    """Share of the response at rest that comes with real poles slower than a structure's [1]."""
+    """Return the share of G(0) that comes with real poles slower than a structure's [1]."""
     poles = dynamics.poles()
     found = 0.0
     for index, pole in enumerate(poles):
@@ -165,8 +167,8 @@ def relaxation_found(dynamics: TransferFunction) -> float:
     return found
 
 
-def _told(survey: Survey, judged: Judged) -> bool:
-    """False for a mode slower than the steps follow each other, which the test hardly shows."""
+def _excited(survey: Survey, judged: Judged) -> bool:
+    """Return False for a mode slower than the steps follow each other: they hardly excite it."""
     return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
 
 
@@ -277,7 +279,7 @@ def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
 
 
 def _mostly(terms: Sequence[HiddenTerm], priors: Mapping[str, float]) -> str:
-    """Words for what costs most of what could hide; empty where nothing could."""
+    """Return the words for what costs most of what could hide; empty where nothing could."""
     if not terms:
         return ""
     worst = max(terms, key=lambda term: term.effect * _carried(term, priors))
@@ -316,14 +318,14 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
 
 
 def _missed(judged: Judged) -> float:
-    """Largest size that the test would have missed with 5 % probability."""
+    """Return the largest size that the test would have missed with 5 % probability."""
     degrees = max(judged.score.degrees, 1)
     limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, degrees))
     return float(limit + _POWER) * judged.score.uncertainty
 
 
 def _departure(family: str, parameter: float, damping: float, frequency: FloatArray) -> FloatArray:
-    """Relative departure of the response at ``frequency`` (k,) [Hz] per unit, complex (k,)."""
+    """Return the complex departure of G, relative, at ``frequency`` (k,) [Hz], per unit, (k,)."""
     s = 2j * np.pi * frequency
     if family == CREEP:
         return np.asarray(-s * parameter / (1 + s * parameter))
@@ -339,7 +341,7 @@ def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArr
 
 
 def omitted(survey: Survey, column: FloatArray) -> FloatArray:
-    """Shift (p,) of the coefficients of G if a term that adds ``column`` (n,) is left out."""
+    """Return the shift (p,) of G's coefficients if a term that adds ``column`` (n,) is omitted."""
     fitted, problem = survey.fitted, survey.problem
     columns = problem.sensitivity(fitted)
     solved = least_squares(columns, column[problem.used], 1e-9)

@@ -129,6 +129,6 @@ def identify(
 
 
 def _findings(evidence: Evidence) -> list[Finding]:
-    """What is wrong, then what a right model leaves open, then how far that reaches."""
+    """Return what is wrong, then what a right model leaves open, then how far that reaches."""
     wrong, range_ = ([check(evidence) for check in part] for part in (CHECKS, RANGE_CHECKS))
     return [*wrong, *evidence.known.findings, *range_]

@@ -44,7 +44,7 @@ def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: fl
 
 
 def _top_energy(increments: FloatArray, noise: float) -> float:
-    """Mean |FFT of the increments|² in the top band [m²], less what encoder noise gives."""
+    """Return mean |FFT of the increments|² in the top band [m²], less what encoder noise gives."""
     power = np.abs(np.fft.rfft(increments)) ** 2
     frequency = np.fft.rfftfreq(len(increments))
     band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])

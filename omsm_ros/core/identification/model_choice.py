@@ -50,7 +50,7 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Those whose poles the record can tell; a delay alone has none."""
+    """Return those whose poles are identifiable; a delay alone has none."""
     duration = len(problem.input) * problem.period
     return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 

@@ -100,7 +100,7 @@ def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
 
 
 def _noise_of_neighbours(values: FloatArray) -> float:
-    """Standard deviation of white noise, which is what neighbouring samples do not share."""
+    """Return the standard deviation of white noise: what neighbouring samples do not share."""
     return float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
 
 
@@ -113,7 +113,7 @@ def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
 
 
 def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> float:
-    """p-value that ``residual`` (k,) does not follow ``drive`` (k,), the motion's rate.
+    """Return p-value that ``residual`` (k,) does not follow ``drive`` (k,), the motion's rate.
 
     The residual is regressed on the last ``lags`` values of the drive, which are correlated;
     so few of its directions count, and only those above rounding are counted.
@@ -133,7 +133,7 @@ def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
 
 
 def response_agreement(left: FrequencyResponse, up_to: float) -> float:
-    """Mean square difference of two responses over its uncertainty, 0 to ``up_to`` [Hz]; about 1.
+    """Return the mean square difference of two responses over its variance, 0 to ``up_to`` [Hz].
 
     left: response, without a model, of what a model leaves of what was seen. That is the
         response of what was seen less that of what was modelled, both through the same

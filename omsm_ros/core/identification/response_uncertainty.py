@@ -122,7 +122,7 @@ def _trusted_up_to(model: Model, band: Band, limits: ResponseLimits, shown: floa
 
 
 def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
-    """Beyond this frequency [Hz] the data could not contradict the model ``best``."""
+    """Return the frequency [Hz] beyond which the data could not contradict the model ``best``."""
     length = len(problem.used)
     compared = np.flatnonzero(problem.used)
     taper = np.zeros(length)
@@ -149,7 +149,7 @@ def _frequencies(problem: Problem) -> FloatArray:
 
 
 def _disagreement(model: Model, band: Band) -> Band:
-    """Largest difference from any other candidate that describes the data about as well."""
+    """Return the largest difference from a candidate that describes the data about as well."""
     chosen = model.chosen.fit.dynamics.response(band.frequency)
     gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
     best = min(c.bic for c in model.candidates)

@@ -40,7 +40,7 @@ class StaticGains:
 
 
 def static_gains(record: MotionRecord) -> StaticGains:
-    """Gains from the means of the plateaus, offset and linear drift allowed for.
+    """Return the gains from the means of the plateaus, offset and linear drift allowed for.
 
     The uncertainty is that of the regression over plateaus, so it holds for whatever makes
     them scatter: noise, backlash, slip. Raises StepTestError with fewer than four plateaus.

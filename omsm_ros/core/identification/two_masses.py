@@ -25,7 +25,7 @@ _GREATEST_UNCERTAINTY = 0.5
 
 
 def table_mass(settings: Mapping[str, object]) -> float | None:
-    """The moving mass of the table [kg] among the settings, or None if it is not there.
+    """Return the moving mass of the table [kg] among the settings, or None if it is not there.
 
     Raises ConfigurationError unless it is the mass of a table.
     """
@@ -38,7 +38,7 @@ def table_mass(settings: Mapping[str, object]) -> float | None:
 def two_mass_entry(
     dynamics: TransferFunction, covariance: FloatArray, up_to: float, mass: float | None
 ) -> dict[str, object] | None:
-    """The two-mass model that ``dynamics`` agrees with up to ``up_to`` [Hz]; None if none does.
+    """Return the two-mass model that agrees with ``dynamics`` to ``up_to`` [Hz]; None without one.
 
     mass: of the table [kg]; None when it is not known: then m1 is 1, and the others are per
         mass of the table

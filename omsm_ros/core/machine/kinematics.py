@@ -65,7 +65,7 @@ def workpiece_points(
     c: FloatArray,
     distance: FloatArray,
 ) -> WorkpiecePoints:
-    """Surface points seen by the probe.
+    """Return the surface points at which the probe looked.
 
     slides: x, y and the probe's own z (H(z)) [m], each (n,);  b, c: [rad], (n,)
     distance: true distance along the beam, growing with the height of the surface [m], (n,)
@@ -90,7 +90,7 @@ def beam_quaternion(geometry: Geometry) -> tuple[float, float, float, float]:
 def _reach(
     geometry: Geometry, b: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """From the point of zero distance at b = 0 to the surface point, in the machine frame.
+    """Return the vector from zero distance at b = 0 to the surface point, in the machine frame [m].
 
     B turns about Y: ``(x, z) -> (x cos b + z sin b, z cos b - x sin b)``.
     """

@@ -47,14 +47,14 @@ class StepPlan:
         return float(np.ptp(np.cumsum([0.0, *self.heights])))
 
     def z(self, time: FloatArray) -> FloatArray:
-        """Commanded position [m] at ``time`` [s], of the same shape."""
+        """Return the commanded position [m] at ``time`` [s], of the same shape."""
         position = np.zeros_like(time)
         for start, height in zip(self.starts, self.heights, strict=True):
             position = position + height * s_curve((time - start) / self.rise)
         return position
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]; only Z moves."""
+        """Return the commanded axes at ``time`` [s]; only Z moves."""
         zero = np.zeros_like(time)
         return AxisPositions(zero, zero, self.z(time), zero, zero)
 
@@ -69,7 +69,7 @@ def plan_steps(
     rise: float = 20e-3,
     half_range: float = 50e-6,
 ) -> StepPlan:
-    """``count`` steps up and as many down, dithered within ``sample_period`` [s].
+    """Return ``count`` steps up and as many down, dithered within ``sample_period`` [s].
 
     Half of the way up, all of it down, half of it up again: a motion about the middle of its
     travel tells a slow relaxation from a drift twice as well as one to its end and back.
@@ -111,7 +111,7 @@ def plan_steps(
 
 
 def plan_csv(plan: StepPlan, period: float) -> str:
-    """``time_s,z_m`` lines every ``period`` [s], a header first.
+    """Return ``time_s,z_m`` lines every ``period`` [s], a header first.
 
     Raises ConfigurationError for more lines than a controller takes.
     """
@@ -127,7 +127,7 @@ def plan_csv(plan: StepPlan, period: float) -> str:
 
 
 def plan_gcode(plan: StepPlan) -> str:
-    """The plan as G-code in millimetres: each edge a G1 at its mean feed, then a G4 dwell.
+    """Return the plan as G-code in millimetres: each edge a G1 at its mean feed, then a G4 dwell.
 
     Jerk is limited by the controller: set its S-curve so that an edge takes ``plan.rise``.
     """

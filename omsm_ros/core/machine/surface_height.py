@@ -11,5 +11,5 @@ class Surface(Protocol):
     """Anything with a height over the plane."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m], of their broadcast shape."""
+        """Return the height [m] at x, y [m], of their broadcast shape."""
         ...

@@ -36,12 +36,12 @@ class Motion(Protocol):
         ...
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]; negative before the start."""
+        """Return the commanded axes at ``time`` [s]; negative before the start."""
         ...
 
 
 def s_curve(phase: FloatArray) -> FloatArray:
-    """Rest-to-rest move from 0 to 1 over ``phase`` 0…1 with a jerk of constant magnitude.
+    """Return rest-to-rest move from 0 to 1 over ``phase`` 0…1 with a jerk of constant magnitude.
 
     The jerk is ±32 (per unit of phase cubed) with signs + - - + over the four quarters.
     """
@@ -87,7 +87,7 @@ class StepTest:
         return self.dwell * (2 * self.count + 1)
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]."""
+        """Return the commanded axes at ``time`` [s]."""
         # Rest before the first edge and after the last one are edges of no height.
         levels = np.r_[np.zeros(1), np.arange(self.count + 1), np.arange(self.count)[::-1]]
         edge = np.floor(time / self.dwell)
@@ -128,7 +128,7 @@ class Spiral:
         return self.start_radius / (self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ)
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]."""
+        """Return the commanded axes at ``time`` [s]."""
         feed = self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ * np.maximum(time, 0.0)
         x = self.start_radius - feed
         return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
@@ -149,7 +149,7 @@ class Circle:
         return self.turns / (abs(self.spindle_speed) * RPM_HZ)
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]."""
+        """Return the commanded axes at ``time`` [s]."""
         x = np.full_like(time, self.radius)
         return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
 
@@ -174,7 +174,7 @@ class Chirp:
     duration: float = 25.0
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]; at rest before the start."""
+        """Return the commanded axes at ``time`` [s]; at rest before the start."""
         running = np.maximum(time, 0.0)
         sweep = (self.end_frequency - self.start_frequency) / self.duration
         turns = self.start_frequency * running + 0.5 * sweep * running**2
@@ -193,7 +193,7 @@ class Multisine:
     duration: float = 20.0
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Commanded axes at ``time`` [s]."""
+        """Return the commanded axes at ``time`` [s]."""
         count, z = len(self.frequencies), np.zeros_like(time)
         for k, frequency in enumerate(self.frequencies):
             z = z + np.cos(2 * np.pi * frequency * time - np.pi * k * k / count)

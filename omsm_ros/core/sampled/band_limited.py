@@ -111,7 +111,7 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
 def _slower(
     dynamics: TransferFunction, covariance: FloatArray, gain: float, factor: float
 ) -> tuple[TransferFunction, FloatArray]:
-    """The dynamics with ``gain``, in a time that runs ``factor`` times slower."""
+    """Return the dynamics with ``gain``, in a time that runs ``factor`` times slower."""
     up = factor ** np.arange(len(dynamics.numerator), dtype=np.float64)
     down = factor ** np.arange(len(dynamics.denominator), dtype=np.float64)
     slower = replace(

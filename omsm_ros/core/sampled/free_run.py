@@ -68,7 +68,7 @@ def resting_output(
 
 
 def _responses(model: SampledModel, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Response (n,) to ``motion``, and (k, n) to each state that the model may start in."""
+    """Return response (n,) to ``motion``, and (k, n) to each state that the model may start in."""
     if model.discrete is not None:
         return _held_responses(model.discrete, motion)
     assert model.continuous is not None  # a band-limited model has nothing else
@@ -87,5 +87,5 @@ def _held_responses(discrete: Discrete, motion: FloatArray) -> tuple[FloatArray,
 
 
 def _decays(denominator: FloatArray, states: int, samples: int) -> FloatArray:
-    """Responses (states, n) to a pulse at each of the first samples."""
+    """Return the responses (states, n) to a pulse at each of the first samples."""
     return np.asarray(signal.lfilter([1.0], denominator, np.eye(states, samples), axis=1))

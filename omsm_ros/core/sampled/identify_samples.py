@@ -117,7 +117,7 @@ def identify_samples(
 
 
 def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Known, float]:
-    """``known`` with uncertainties that hold those of the free choice, and their factor."""
+    """Return ``known`` with uncertainties that hold those of the free choice, and their factor."""
     if choice.chosen.order == choice.free.order:
         return known, 1.0
     free = _Known.of(choice.free, choice.delay, period)

@@ -34,13 +34,13 @@ class Discrete:
     covariance: FloatArray
 
     def response(self, frequency: FloatArray, period: float) -> ComplexArray:
-        """H at ``frequency`` (k,) [Hz], for samples every ``period`` [s]."""
+        """Return H at ``frequency`` (k,) [Hz], for samples every ``period`` [s]."""
         q = np.exp(-2j * np.pi * np.asarray(frequency) * period)
         up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
         return np.asarray(up / down * q**self.delay, np.complex128)
 
     def band(self, frequency: FloatArray, period: float) -> Band:
-        """Standard uncertainty of gain, relative, and phase [rad] at ``frequency`` (k,) [Hz]."""
+        """Return the standard uncertainty of relative gain and of phase at ``frequency`` [Hz]."""
         q = np.exp(-2j * np.pi * np.asarray(frequency) * period)[:, np.newaxis]
         up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
         jacobian = np.concatenate(
@@ -88,7 +88,7 @@ class SampledModel:
     certificate: Mapping[str, object] = field(default_factory=dict)
 
     def content(self) -> dict[str, object]:
-        """The model as JSON values."""
+        """Return the model as JSON values."""
         return {
             "schema": SCHEMA,
             "hold": self.hold,
@@ -103,7 +103,7 @@ class SampledModel:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
-        """The inverse of :meth:`content`, for values of the right types.
+        """Return the inverse of :meth:`content`, for values of the right types.
 
         Raises CalibrationError for a model that cannot be, or that cannot be computed with.
         """
@@ -183,7 +183,7 @@ def _discrete_of(content: Mapping[str, Any]) -> Discrete:
 
 
 def _square(values: Sequence[float], size: int) -> FloatArray:
-    """A covariance from its rows one behind the other."""
+    """Return a covariance from its rows one behind the other."""
     if len(values) != size**2:
         raise CalibrationError(
             f"covariance has {len(values)!r} numbers, expected {size**2}; identify it again"

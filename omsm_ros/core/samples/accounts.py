@@ -61,7 +61,7 @@ class Account:
     distance: StreamAccount = StreamAccount()
 
     def as_dict(self) -> dict[str, dict[str, object]]:
-        """JSON values: stream -> received, corrected, pending, counted {reason: samples}."""
+        """Return JSON values: stream -> received, corrected, pending, counted {reason: samples}."""
         return asdict(self)
 
 
@@ -87,6 +87,6 @@ class Tally:
             self.count(Reason(value), int(samples))
 
     def snapshot(self, pending: int) -> StreamAccount:
-        """The account as it stands with ``pending`` samples waiting."""
+        """Return the account as it stands with ``pending`` samples waiting."""
         counted = {reason.name.lower(): n for reason, n in sorted(self._counted.items()) if n}
         return StreamAccount(self.received, self.corrected, pending, counted, self.missing)

@@ -64,7 +64,7 @@ class TriggerCount:
         return Arrival(self._session, first, skip, min(late, skip), missing)
 
     def end(self) -> None:
-        """Whatever comes next begins a session."""
+        """Begin a session with whatever comes next."""
         self._newest_stamp_ns = None
 
     def _begins_anew(self, first: int, block: Block) -> bool:

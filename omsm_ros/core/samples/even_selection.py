@@ -54,7 +54,7 @@ class EvenSelection:
         self._every *= 2
 
     def rows(self) -> NDArray[Any]:
-        """All rows kept so far, in order; empty before the first."""
+        """Return all rows kept so far, in order; empty before the first."""
         if len(self._parts) != 1:
             self._parts = [np.concatenate(self._parts)] if self._parts else [np.empty(0)]
         return self._parts[0]

@@ -51,14 +51,14 @@ class Clock:
     jitter: float
 
     def since(self, count: FloatArray, origin_ns: int) -> FloatArray:
-        """Times of samples ``count`` (n,) after ``origin_ns`` [s]."""
+        """Return the times of samples ``count`` (n,) after ``origin_ns`` [s]."""
         whole = self.start_ns - origin_ns
         fine = self.offset_ns + (count - self.first) * self.period_ns
         return np.asarray((whole + fine) / NANOSECONDS_PER_S, np.float64)
 
 
 def fit_clock(blocks: Sequence[Block]) -> Clock:
-    """The line through the stamps of one session's blocks, its first sample the reference.
+    """Return the line through the stamps of one session's blocks, its first sample the reference.
 
     Raises DataError if the stamps contradict the blocks' sample period.
     """
@@ -89,7 +89,7 @@ def axes_at_probe(
     delay: float = 0.0,
     exposure: float = 0.0,
 ) -> list[AxisBlock]:
-    """An axis block for every distance block, of the same counts, stamp and period.
+    """Return an axis block for every distance block, of the same counts, stamp and period.
 
     delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
     exposure: over which the probe averages, and so is the motion [s]
@@ -162,7 +162,7 @@ def _at(
 
 
 def _sessions(blocks: Iterable[B]) -> list[list[B]]:
-    """Blocks by session, without those that overlap or come late."""
+    """Return the blocks by session, without those that overlap or come late."""
     count, placed = TriggerCount(), []
     for block in blocks:
         admission = count.place(block, len(block))
@@ -172,7 +172,7 @@ def _sessions(blocks: Iterable[B]) -> list[list[B]]:
 
 
 def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], Clock]]:
-    """Uninterrupted runs of blocks, each with the clock of its session."""
+    """Return uninterrupted runs of blocks, each with the clock of its session."""
     runs: list[tuple[list[AxisBlock], Clock]] = []
     for session in _sessions(blocks):
         clock, run = fit_clock(session), session[:1]

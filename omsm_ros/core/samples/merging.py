@@ -48,7 +48,7 @@ def _continues(first: B, length: int, block: B) -> bool:
 
 
 def _told(block: B) -> tuple[str, ...]:
-    """Names of the channels that have samples: an empty one means something of its own."""
+    """Return names of the channels that have samples: an empty one means something of its own."""
     return tuple(name for name in _channels(block) if len(getattr(block, name)))
 
 

@@ -55,7 +55,7 @@ class BlockBuffer(Generic[B]):
         return self._samples
 
     def recent(self, duration: float = 0.0) -> list[B]:
-        """Blocks that reach into the last ``duration`` seconds of the motion; 0 = all."""
+        """Return blocks that reach into the last ``duration`` seconds of the motion; 0 = all."""
         if not self._blocks or duration == 0:
             return list(self._blocks)
         last = self._blocks[-1]

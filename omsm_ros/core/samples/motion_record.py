@@ -79,7 +79,7 @@ class MotionRecord:
         ok: BoolArray | None = None,
         reference: FloatArray | None = None,
     ) -> MotionRecord:
-        """A record of plain arrays (n,); NaN in any channel marks a lost sample."""
+        """Return a record of plain arrays (n,); NaN in any channel marks a lost sample."""
         z = np.asarray(z, np.float64)
         distance = np.asarray(distance, np.float64)
         known = np.isfinite(z)
@@ -135,12 +135,12 @@ def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]
 
 
 def _ordered(blocks: Iterable[B]) -> list[B]:
-    """As they were taken, not as they came."""
+    """Return blocks in the order in which they were taken, not in which they came."""
     return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
 
 
 def _runs(blocks: Iterable[Block], values: Values, intake: Intake) -> Iterator[Run]:
-    """What is new of each block: ``values`` gives its channel (n,), and where it is usable."""
+    """Yield what is new of each block; ``values`` gives its channel (n,) and where it is usable."""
     for block in _ordered(blocks):
         if (arrival := intake.new(block)) is not None:
             value, ok = values(block)
@@ -187,7 +187,7 @@ class _Grid:
     def matched(
         self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
     ) -> tuple[FloatArray, BoolArray, StreamAccount]:
-        """Readings on the grid (n,), where they are usable, and where all of them have gone.
+        """Return readings on the grid (n,), True where usable (n,), and the account of all of them.
 
         Raises DataError where their counter slipped against that of the axes.
         """
@@ -277,7 +277,7 @@ def _by_stamp(
 
 
 def _refined(block: DistanceBlock, finer: int) -> DistanceBlock:
-    """The block on a grid ``finer`` times as fine, its readings ``finer`` counts apart."""
+    """Return the block on a grid ``finer`` times as fine, its readings ``finer`` counts apart."""
     values = np.full(len(block) * finer, np.nan)
     values[::finer] = np.where(block.ok, block.distance, np.nan)
     return DistanceBlock(
@@ -303,7 +303,7 @@ def _as_axis(block: DistanceBlock) -> AxisBlock:
 
 
 def _covered(record: MotionRecord) -> MotionRecord:
-    """The record from the first to the last sample at which the axis is known.
+    """Return the record from the first to the last sample at which the axis is known.
 
     Raises DataError if there is none.
     """
@@ -328,7 +328,7 @@ def _covered(record: MotionRecord) -> MotionRecord:
 def _unfilled(
     counts: Mapping[str, int], distance: Sequence[DistanceBlock], finer: int
 ) -> dict[str, int]:
-    """The account of the readings themselves, without what lies between them on the grid."""
+    """Return the account of the readings themselves, without what lies between them on the grid."""
     received = sum(map(len, distance))
     duplicates, unmatched = (counts[name] // finer for name in ("duplicates", "unmatched"))
     paired = counts["paired"]

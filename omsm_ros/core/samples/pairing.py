@@ -49,7 +49,7 @@ class Run:
     def of(
         cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
     ) -> Run:
-        """What is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
+        """Return what is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
         period_ns = _period_ns(block)
         whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
         return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
@@ -63,11 +63,11 @@ class Run:
         return self.first + len(self)
 
     def stamp_of(self, count: int) -> float:
-        """Time of the sample ``count`` [ns]."""
+        """Return the time of the sample ``count`` [ns]."""
         return self.stamp_ns + (count - self.first) * self.period_ns
 
     def part(self, start: int, stop: int) -> Run:
-        """The samples from index ``start`` up to ``stop``."""
+        """Return the samples from index ``start`` up to ``stop``."""
         return Run(
             self.session,
             self.first + start,
@@ -116,7 +116,7 @@ class Intake:
             self.stamps.add(arrival.session, first + skip, stamp_ns)
 
     def end(self) -> None:
-        """Whatever comes next begins a session."""
+        """Begin a session with whatever comes next."""
         self._count.end()
 
 
@@ -167,7 +167,7 @@ class Queue:
             self.given_up = self.drop(excess, Reason.OVERDUE)
 
     def clear(self) -> None:
-        """Nothing that waits will find a partner."""
+        """Drop all that waits, which will find no partner."""
         while self._runs:
             self.drop(len(self._runs[0]))
 
@@ -204,7 +204,7 @@ class Pairing:
         self._link = _Link(-1, -1)
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
-        """Runs of axes and distance of equal count and length, as far as they are complete."""
+        """Yield complete runs of axes and distance, of equal count and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
             if order < 0:
@@ -217,7 +217,7 @@ class Pairing:
                 yield from self._joined(a, d)
 
     def _joined(self, a: Run, d: Run) -> Iterator[tuple[Run, Run]]:
-        """The pairs that two heads of equal count make, but for those that have slipped."""
+        """Yield the pairs that two heads of equal count make, but for those that have slipped."""
         self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
         start, end = 0, a.first + min(len(a), len(d))
         for until, slipped in self.watch.spans((a.session, d.session), a.first, end, a.period_ns):
@@ -233,7 +233,7 @@ class Pairing:
             start = stop
 
     def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
-        """Samples of ``run`` before the other head, all of them if the sessions differ."""
+        """Return samples of ``run`` before the other head, all of them if the sessions differ."""
         if not self._linked(a, d):
             return len(run)
         return min(other_first - run.first, len(run))
@@ -242,7 +242,7 @@ class Pairing:
         return (a.session, d.session) == (self._link.axes, self._link.distance)
 
     def _order(self, a: Run, d: Run) -> int:
-        """-1: the axes' head has no partner; 1: the distance's; 0: both begin with a pair."""
+        """Return -1 if the axes' head has no partner, 1 if the distance's, 0 for a pair."""
         if not self._linked(a, d):
             if _apart(a, d):
                 return self._older(a, d)
@@ -251,7 +251,7 @@ class Pairing:
         return _sign(a.first - d.first)
 
     def _older(self, a: Run, d: Run) -> int:
-        """Which of two heads that cannot be of one session is left over from before."""
+        """Return which of two heads that cannot be of one session is left over from before."""
         if a.session == self._link.axes:
             return -1
         if d.session == self._link.distance:
@@ -260,13 +260,13 @@ class Pairing:
 
 
 def _apart(a: Run, d: Run) -> bool:
-    """True if one trigger count would have had two different times."""
+    """Return True if one trigger count would have had two different times."""
     count = max(a.first, d.first)
     return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
 
 
 def _missing(run: Run, other: Queue) -> Reason:
-    """Why the other stream has no partner for the first sample of ``run``: did it give it up?"""
+    """Return why the other stream has no partner for the first sample of ``run``."""
     lost = other.given_up
     overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
     return Reason.OVERDUE if overdue else Reason.UNMATCHED

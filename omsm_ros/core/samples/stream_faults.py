@@ -128,6 +128,6 @@ def skew_fault(
 
 
 def _stamp_at(where: FloatArray, count: FloatArray, stamp: FloatArray, period: float) -> FloatArray:
-    """Stamps between blocks on a line; beyond the last, a sample a period."""
+    """Return the stamps between blocks on a line; beyond the last, a sample a period."""
     beyond = np.maximum(where - count[-1], 0.0) - np.maximum(count[0] - where, 0.0)
     return np.asarray(np.interp(where, count, stamp) + beyond * period, np.float64)

@@ -21,7 +21,7 @@ class LoadMeter:
         self._worst_ns = 0
 
     def block(self, arrived_ns: int, done_ns: int) -> None:
-        """A block that arrived at ``arrived_ns`` was dealt with at ``done_ns`` [ns]."""
+        """Note the block that arrived at ``arrived_ns`` and was done at ``done_ns`` [ns]."""
         self._latencies.append(done_ns - arrived_ns)
         self._worst_ns = max(self._worst_ns, done_ns - arrived_ns)
 
@@ -31,7 +31,7 @@ class LoadMeter:
         return worst * NANOSECOND_S / MILLISECOND_S
 
     def report(self, cpu: float, wall: float) -> dict[str, float]:
-        """Median, 99 % point, maximum of the latency [ms]; share of a core since the last report.
+        """Return median, 99 % point and maximum latency [ms]; share of a core since last called.
 
         cpu, wall: processor time used so far, and any steady clock [s]
         """

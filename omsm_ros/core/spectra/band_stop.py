@@ -82,7 +82,7 @@ def _sections(low: float, high: float, period: float) -> FloatArray:
 
 
 def _padding(sections: FloatArray) -> int:
-    """Samples until an end has rung out, by the slowest pole."""
+    """Return the samples until an end has rung out, by the slowest pole."""
     poles = np.concatenate([np.roots(section[3:]) for section in sections])
     slowest = float(np.max(abs(poles)))
     return int(np.ceil(np.log(_RUNG_OUT) / np.log(min(slowest, 1 - 1e-9))))

@@ -113,14 +113,14 @@ def _key_at(own: int, scan: StudiedScan, place: Place) -> Key:
 
 
 def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
-    """True if the scans have rings of the part in common."""
+    """Return True if the scans have rings of the part in common."""
     a, b = one.signal.radius, other.signal.radius
     low, high = max(a.min(), b.min()), min(a.max(), b.max())
     return bool(high - low >= -0.02 * max(a.max(), b.max()))
 
 
 def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Claim, ...]:
-    """Hypotheses that some scan tells from those of all other kinds, and none speaks against."""
+    """Return hypotheses that a scan separates from all other kinds, and that none contradicts."""
     alive = [t for t in tested if t.alive]
     found = []
     for one in alive:
@@ -132,7 +132,7 @@ def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Cla
 
 
 def _is_rival(one: Tested, other: Tested) -> bool:
-    """What folds to the same place is no rival of what does not; else every kind is."""
+    """Return True for another kind, unless it folds: what folds is no rival of what does not."""
     if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
         return False  # on circles of one radius a figure of the part repeats just so
     return one.kind != other.kind and not other.hypothesis.folds
@@ -144,7 +144,7 @@ def _tells(scan: StudiedScan, one: Tested, rivals: Sequence[Tested]) -> bool:
 
 
 def _least_folded(found: list[Claim]) -> list[Claim]:
-    """Of the frequencies that a vibration may have, the one in most scans, then the lowest."""
+    """Return the claims with one vibration: that in most scans, then the lowest frequency."""
     shaken = [c for c in found if c.kind == VIBRATION]
     if not shaken:
         return found
@@ -155,7 +155,7 @@ def _least_folded(found: list[Claim]) -> list[Claim]:
 def _images(
     scans: Sequence[StudiedScan], claims: dict[Key, tuple[Claim, ...]]
 ) -> dict[Key, list[Claim]]:
-    """Lines where a texture, which another scan resolves, folds to in a scan too coarse for it."""
+    """Return lines to which a texture that another scan resolves folds in a scan too coarse."""
     found: dict[Key, list[Claim]] = {}
     for key, own in claims.items():
         for texture in own:
@@ -182,7 +182,7 @@ class Settled:
     also: dict[Key, Claim] = field(default_factory=dict)
 
     def open_claims(self, key: Key) -> list[Claim]:
-        """Claims of a line whose partners are not all explained as something else.
+        """Return the claims of a line whose partners are not all explained as something else.
 
         All of them if none is left: a line is something.
         """
@@ -236,7 +236,7 @@ def _urgency(done: Settled, key: Key, claims: Sequence[Claim]) -> tuple[bool, in
 
 
 def _largest(done: Settled, key: Key, claims: Sequence[Claim]) -> Claim:
-    """Of several things at one frequency the one that is strongest where it is alone."""
+    """Return, of several things at one frequency, the one that is strongest where it is alone."""
     by_kind: dict[str, list[Claim]] = {}
     for claim in claims:
         by_kind.setdefault(_family(claim.kind), []).append(claim)
@@ -248,7 +248,7 @@ def _largest(done: Settled, key: Key, claims: Sequence[Claim]) -> Claim:
 
 
 def size_elsewhere(done: Settled, claims: Sequence[Claim]) -> float:
-    """Greatest amplitude of the partners that nothing else explains [m]."""
+    """Return the greatest amplitude of the partners that nothing else explains [m]."""
     found = [
         done.evidence[p].line.amplitude
         for c in claims
@@ -259,11 +259,11 @@ def size_elsewhere(done: Settled, claims: Sequence[Claim]) -> float:
 
 
 def _family(kind: str) -> str:
-    """A texture is one thing, whether a scan resolves it or folds it."""
+    """Return the kind; a texture that is folded is of the same family as one that is resolved."""
     return PART if kind == ARTEFACT else kind
 
 
 def radius_or_turn(tested: Sequence[Tested]) -> bool:
-    """True if a line may be rings on the part as well as the spindle, both with partners."""
+    """Return True if a line may be rings on the part as well as the spindle, both with partners."""
     kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.present}
     return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)

@@ -85,7 +85,7 @@ def _coordinate(
 
 
 def _proportional(values: FloatArray, other: FloatArray) -> float:
-    """How far ``values`` departs from proportion to ``other``, in its own unit."""
+    """Return how far ``values`` departs from proportion to ``other``, in its own unit."""
     slope, start = np.polyfit(other - other[0], values, 1)
     return float(np.max(abs(values - slope * (other - other[0]) - start)))
 
@@ -118,9 +118,10 @@ def floor_of(power: FloatArray) -> FloatArray:
 
 
 def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[float, float]:
-    """Could a line of ``frequency`` in ``one`` be one in ``other``?
+    """Return how much of the power of a line of ``one`` a line of ``other`` takes, and where.
 
-    Return the share of its power that a line in ``other`` can take, and the frequency there.
+    The share [1], largest over its frequencies, and that frequency, in the unit of ``other``;
+    ``frequency`` in that of ``one``.
     """
     every = max(len(one.values) // _MOST_COMPARED, 1)
     phase = frequency * one.values[::every]

@@ -27,7 +27,7 @@ class Density:
     step: float
 
     def power(self, low: float, high: float) -> float:
-        """Mean square between two frequencies, both included [m²]."""
+        """Return the mean square between two frequencies, both included [m²]."""
         inside = (self.frequency >= low) & (self.frequency <= high)
         return float(np.sum(self.density[inside]) * self.step)
 

@@ -102,7 +102,7 @@ class FormFit:
         return _Basis.of(self._signal).up_to(self._degree)
 
     def _enough(self, values: FloatArray, worth: float) -> int:
-        """The degree beyond which nothing worth it is taken away; few parts need a high one."""
+        """Return the degree beyond which nothing worth it is removed; few parts need a high one."""
         for top in (_USUAL_DEGREE, max(_DEGREES)):
             basis = _Basis.of(self._signal).up_to(top)
             gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
@@ -143,7 +143,7 @@ class FormFit:
         )
 
     def owned(self) -> list[tuple[float, float]]:
-        """Waves a turn that belong to form and orders, and how many resolutions about each.
+        """Return waves a turn that belong to form and orders, and how many resolutions about each.
 
         A harmonic with q radial functions reaches q/2 resolutions to either side.
         """
@@ -187,12 +187,12 @@ class _Basis:
         return cls(tuple(names), on_circle, largest)
 
     def up_to(self, degree: int) -> _Basis:
-        """Only the columns that a fit of ``degree`` has."""
+        """Return only the columns that a fit of ``degree`` has."""
         kept = tuple(name for name in self.names if self.degree(name) <= degree)
         return replace(self, names=kept)
 
     def degree(self, name: tuple[str, int, int]) -> int:
-        """From which degree on a column belongs to the fit; of a scan along no turn, of time."""
+        """Return the degree from which on the fit has a column; without turns, of time."""
         kind, n, _ = name
         free = kind == "order" or (kind == "drift" and n <= _DRIFT_DEGREE and self._turning)
         return 0 if free else n
@@ -202,7 +202,7 @@ class _Basis:
         return any(kind == "order" for kind, _, _ in self.names)
 
     def columns(self, signal: ScanSignal, chosen: np.ndarray) -> FloatArray:
-        """Values of all columns at the samples ``chosen`` (m,): (m, p)."""
+        """Return the values of all columns at the samples ``chosen`` (m,): (m, p)."""
         time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
         rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
         highest = max((abs(m) for _, _, m in self.names), default=0)
@@ -220,7 +220,7 @@ class _Basis:
 
 
 def _radial(degree: int, harmonic: int, rho: FloatArray) -> FloatArray:
-    """Radial part of a Zernike polynomial, by its sum (Noll 1976, Eq. 2)."""
+    """Return the radial part of a Zernike polynomial, by its sum (Noll 1976, Eq. 2)."""
     half = (degree - harmonic) // 2
     terms = [
         (-1) ** s * comb(degree - s, s) * comb(degree - 2 * s, half - s) for s in range(half + 1)
@@ -259,7 +259,7 @@ def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatAr
 def _enough(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
 ) -> int:
-    """The degree beyond which nothing worth it is taken away."""
+    """Return the degree beyond which nothing worth it is taken away."""
     needed = np.array([basis.degree(name) for name in basis.names])
     left, kept = energy, 0
     for degree in (d for d in _DEGREES if d <= needed.max()):
@@ -295,7 +295,7 @@ def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> Float
 def _orders(
     basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
 ) -> Iterator[Order]:
-    """Orders that stand by themselves; ``mean``: of products of columns (p, p).
+    """Yield the orders that stand by themselves; ``mean``: of products of columns (p, p).
 
     Where the radius changes little, an order and a figure of the same harmonic may grow large
     against each other: neither is known then, and the order counts as form.

@@ -61,7 +61,7 @@ class StudiedScan:
         return self.spectrum.coordinates
 
     def resolution(self, coordinate: str) -> float:
-        """[Hz], [1/m] or [1/turn]"""
+        """Return the unit of frequencies: Hz, 1/m or 1/turn."""
         return self.coordinates[coordinate].resolution
 
 
@@ -111,7 +111,7 @@ def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
 
 
 def whole_order(scan: StudiedScan, line: Line) -> int | None:
-    """How many waves a turn the line has, if it is a whole number."""
+    """Return how many waves a turn the line has, if it is a whole number."""
     if TURN not in line.possible or scan.signal.turns < _LEAST_TURNS:
         return None
     per_turn = line.possible[TURN]
@@ -124,7 +124,7 @@ def whole_order(scan: StudiedScan, line: Line) -> int | None:
 
 
 def spread_of(scan: StudiedScan, line: Line, coordinate: str) -> float:
-    """How far the true frequency in ``coordinate`` may be from where the line was seen."""
+    """Return how far the true frequency in ``coordinate`` may be from where the line was seen."""
     return (
         _TIMES_UNCERTAINTY * _own_spread(scan, line, coordinate)
         + _OTHER_BIN * scan.resolution(coordinate)
@@ -133,13 +133,13 @@ def spread_of(scan: StudiedScan, line: Line, coordinate: str) -> float:
 
 
 def _own_spread(scan: StudiedScan, line: Line, coordinate: str) -> float:
-    """Standard uncertainty of its frequency in ``coordinate``."""
+    """Return the standard uncertainty of its frequency in ``coordinate``."""
     share = scan.resolution(coordinate) / scan.resolution(line.coordinate)
     return line.frequency_uncertainty * share
 
 
 def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
-    """Where the line would be in ``scan``; None if the scan cannot show it."""
+    """Return where the line would be in ``scan``; None if the scan cannot show it."""
     coordinate = scan.coordinates.get(hypothesis.coordinate)
     if coordinate is None:
         return None
@@ -155,14 +155,14 @@ def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
 
 
 def apart(one: Place | None, other: Place | None) -> bool:
-    """True if two hypotheses are told apart by a scan in which they have these places."""
+    """Return True if a scan in which two hypotheses have these places separates them."""
     if one is None or other is None or one.coordinate != other.coordinate:
         return True
     return abs(one.frequency - other.frequency) > one.tolerance + other.tolerance
 
 
 def found_at(scan: StudiedScan, place: Place) -> Line | None:
-    """The line of ``scan`` at ``place``, the strongest if there are several."""
+    """Return the line of ``scan`` at ``place``, the strongest if there are several."""
     near = [
         line
         for line in scan.lines
@@ -174,14 +174,14 @@ def found_at(scan: StudiedScan, place: Place) -> Line | None:
 
 
 def by_chance(scan: StudiedScan, place: Place) -> float:
-    """How many lines of ``scan`` would lie at ``place`` if they lay anywhere."""
+    """Return how many lines of ``scan`` would lie at ``place`` if they lay anywhere."""
     band = scan.coordinates[place.coordinate].highest
     count = sum(place.coordinate in line.possible for line in scan.lines)
     return count * 2 * place.tolerance / band
 
 
 def told_by(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
-    """Is the line, of ``amplitude`` [m] elsewhere, in ``scan``? None if the scan cannot tell."""
+    """Return whether a line of ``amplitude`` [m] elsewhere is in ``scan``; None: undecidable."""
     place = place_in(scan, hypothesis)
     if place is None or by_chance(scan, place) > _GREATEST_CHANCE:
         return None
@@ -197,7 +197,7 @@ def told_by(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool
 
 
 def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude: float) -> bool:
-    """True if the line could be there and not be found."""
+    """Return True if the line could be there and not be found."""
     if hypothesis.kind == VIBRATION:
         return False  # the machine may stand still: absence is no proof, and is never used as one
     if place.coordinate == TIME:
@@ -212,7 +212,7 @@ def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude
 
 
 def _near_form(scan: StudiedScan, place: Place) -> bool:
-    """True where taking out the form takes a line out as well."""
+    """Return True where taking out the form takes a line out as well."""
     turn = scan.coordinates.get(TURN)
     if turn is None:
         return False
@@ -225,6 +225,6 @@ def _near_form(scan: StudiedScan, place: Place) -> bool:
 
 
 def _least_share(scan: StudiedScan, hypothesis: Hypothesis) -> float:
-    """Of a texture's amplitude, if the probe averages over a whole sample period."""
+    """Return the share of a texture's amplitude that an average over a sample period leaves."""
     coordinate = scan.coordinates[hypothesis.coordinate]
     return float(abs(np.sinc(hypothesis.frequency * coordinate.pace * scan.signal.period)))

@@ -121,7 +121,7 @@ def _best_version(line: Line, coordinates: dict[str, Coordinate], values: FloatA
 def waves_of(
     lines: Sequence[Line], coordinates: dict[str, Coordinate]
 ) -> Callable[[np.ndarray], FloatArray]:
-    """Cosine and sine of every line at the samples asked for, to be fitted beside the form."""
+    """Return a function: cosine and sine of every line at given samples, to fit beside the form."""
 
     def waves(chosen: np.ndarray) -> FloatArray:
         columns: list[FloatArray] = []
@@ -134,7 +134,7 @@ def waves_of(
 
 
 def _apart(lines: list[Line], coordinates: dict[str, Coordinate]) -> list[Line]:
-    """Without the weaker of two that are one."""
+    """Return ``lines`` without the weaker of any two that are one."""
     kept: list[Line] = []
     for line in sorted(lines, key=lambda one: -one.amplitude):
         bin_ = coordinates[line.coordinate].resolution
@@ -158,7 +158,7 @@ def _columns(line: Line, place: FloatArray, middle: float, turning: bool) -> lis
 def _stepped(
     lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray, *, turning: bool
 ) -> list[Line]:
-    """One Gauss-Newton step of cosines, sines and, if ``turning``, frequencies."""
+    """Return one Gauss-Newton step of cosines, sines and, if ``turning``, frequencies."""
     per = 3 if turning else 2
     gram, moment = np.zeros((per * len(lines),) * 2), np.zeros(per * len(lines))
     for first in range(0, len(values), _CHUNK):
@@ -182,9 +182,9 @@ def _stepped(
 
 
 def _moved(line: Line, step: FloatArray, coordinate: Coordinate) -> Line:
-    """A frequency moves by half a resolution at most, for further away it is another line.
+    """Return ``line`` moved by ``step``, half a resolution at most: beyond is another line.
 
-    The derivative is taken about the middle of the scan, the phase told at its zero.
+    The derivative is taken about the middle of the scan, the phase at the coordinate's zero.
     """
     cosine, sine = line.cosine + step[0], line.sine + step[1]
     if len(step) < 3:
@@ -197,7 +197,7 @@ def _moved(line: Line, step: FloatArray, coordinate: Coordinate) -> Line:
 
 
 def sum_of(lines: Sequence[Line], coordinates: dict[str, Coordinate], count: int) -> FloatArray:
-    """Heights of all ``lines`` together [m], (count,)."""
+    """Return the heights of all ``lines`` together [m], (count,)."""
     total = np.zeros(count)
     for line in lines:
         phase = 2 * np.pi * line.frequency * coordinates[line.coordinate].values

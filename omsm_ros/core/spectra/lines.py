@@ -66,7 +66,7 @@ class LineSpectrum:
     amplitude_floor: FloatArray
 
     def sigma_at(self, frequency: float) -> float:
-        """Standard deviation of an amplitude over time at ``frequency`` [Hz]."""
+        """Return the standard deviation of an amplitude over time at ``frequency`` [Hz]."""
         return float(np.interp(frequency, self.floor_frequency, self.amplitude_floor))
 
 
@@ -111,7 +111,7 @@ def _strongest(
     known: Sequence[Line],
     taken: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[Line]:
-    """The strongest lines left, all of one coordinate."""
+    """Return the strongest lines left, all of one coordinate."""
     best: tuple[float, list[Line]] = (0.0, [])
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)
@@ -135,7 +135,7 @@ def _strongest(
 def _reserved(
     coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
 ) -> dict[str, list[tuple[float, float]]]:
-    """Frequencies of ``owned`` waves a turn, over turns, over time, and along all rings."""
+    """Return frequencies of ``owned`` waves a turn, over turns, over time, and along all rings."""
     turn, path = coordinates.get(TURN), coordinates.get(PATH)
     if turn is None:
         return {}
@@ -156,8 +156,9 @@ def _reserved(
 
 
 def _is_shadow(new: Line, known: Sequence[Line], coordinates: dict[str, Coordinate]) -> bool:
-    """True for what another coordinate makes of a line that is known; a fit of both would let
-    them grow against each other.
+    """Return True for the image of a known line in another coordinate.
+
+    A fit of both would let them grow against each other.
     """
     own = coordinates[new.coordinate]
     for line in known:
@@ -176,7 +177,7 @@ def _free(
     coordinates: dict[str, Coordinate],
     reserved: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[Line]:
-    """Without those that have moved to where form and orders are."""
+    """Return ``lines`` without those that have moved to where form and orders are."""
     return [
         line
         for line in lines
@@ -188,7 +189,7 @@ def _free(
 
 
 def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
-    """Places of local maxima above ``least``, largest first."""
+    """Return the places of local maxima above ``least``, largest first."""
     inner = ratio[1:-1]
     top = (inner >= ratio[:-2]) & (inner > ratio[2:]) & (inner > least)
     places = np.flatnonzero(top) + 1
@@ -211,7 +212,7 @@ def _judged(
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> LineSpectrum:
-    """The lines with their uncertainties, those that stand out of what all of them leave."""
+    """Return the lines with their uncertainties, those that stand out of what all of them leave."""
     floors = {}
     for name in {TIME, *(line.coordinate for line in lines)}:
         power, spacing = power_over(signal, residual, coordinates[name])
@@ -248,7 +249,7 @@ def _judged(
 
 
 def _possible(line: Line, ratio: float, coordinates: dict[str, Coordinate]) -> dict[str, float]:
-    """In which coordinates the data allow it to be a line, with the frequency there."""
+    """Return the coordinates in which the data allow it to be a line, with the frequency there."""
     own = coordinates[line.coordinate]
     found = {line.coordinate: line.frequency}
     for name, other in coordinates.items():

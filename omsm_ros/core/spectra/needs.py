@@ -15,24 +15,24 @@ _SAME_PACE = 0.02
 
 
 def along(coordinate: str) -> str:
-    """How a wavelength is measured."""
+    """Return in words along what a wavelength is measured."""
     return {PATH: "along the path", RADIUS: "from ring to ring"}.get(
         coordinate, f"over {coordinate}"
     )
 
 
 def images(frequency: float, rate: float) -> str:
-    """The lowest frequencies [Hz] beyond half of ``rate`` [Hz] that are seen at ``frequency``."""
+    """Return the lowest frequencies beyond ``rate`` / 2 [Hz] that fold to ``frequency``."""
     return ", ".join(hertz(f) for f in (rate - frequency, rate + frequency)) + ", …"
 
 
 def hertz(frequency: float) -> str:
-    """A frequency of a line: lines are told apart by their sixth digit."""
+    """Return a frequency [Hz] in words; lines differ in their sixth digit."""
     return quantity(frequency, "Hz", 6)
 
 
 def to_decide(scans: Sequence[StudiedScan], own: int, line: Line, kinds: set[str]) -> str:
-    """What would tell the kinds that are left apart."""
+    """Return what would tell the kinds that are left apart."""
     scan, found = scans[own], []
     others = [s for k, s in enumerate(scans) if k != own]
     if not any(_other_pace(scan, s, line) for s in others):
@@ -47,7 +47,7 @@ def to_decide(scans: Sequence[StudiedScan], own: int, line: Line, kinds: set[str
 
 
 def _other_pace(scan: StudiedScan, other: StudiedScan, line: Line) -> bool:
-    """True if any coordinate of the line runs at another pace in ``other``."""
+    """Return True if any coordinate of the line runs at another pace in ``other``."""
     for name in line.possible:
         if name != TIME and name in other.coordinates:
             here, there = scan.coordinates[name].pace, other.coordinates[name].pace

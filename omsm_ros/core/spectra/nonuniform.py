@@ -47,11 +47,11 @@ def _kernel(distance: FloatArray) -> FloatArray:
 
 
 def _kernel_transform(frequency: FloatArray) -> FloatArray:
-    """Of the kernel over grid cells, at ``frequency`` [1/cell]."""
+    """Return the transform of the kernel over grid cells, at ``frequency`` [1/cell]."""
     inside = np.sqrt(_BETA**2 - (np.pi * _WIDTH * frequency) ** 2)
     return np.asarray(_WIDTH * np.sinh(inside) / inside)
 
 
 def _even(count: int) -> int:
-    """The next power of two, for a fast transform."""
+    """Return the next power of two, for a fast transform."""
     return 1 << (count - 1).bit_length()

@@ -112,7 +112,7 @@ def study_all(scans: Sequence[tuple[ScanSignal, Felt | None]]) -> list[StudiedSc
 
 
 def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float, float]]:
-    """Waves beyond the reach of ``one``, and how well they are known, the best known first."""
+    """Return waves that ``one`` cannot resolve and their uncertainty, the best known first."""
     path = one.coordinates.get(PATH)
     if path is None or path.proportional_to_time:
         return []
@@ -149,7 +149,7 @@ def _apart(
 
 
 def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
-    """The significant orders as lines over turns, and over what is proportional to turns."""
+    """Return the significant orders as lines over turns, and over what is proportional to turns."""
     coordinates = spectrum.coordinates
     for found in formless.orders:
         ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
@@ -176,7 +176,7 @@ def _order_lines(formless: Formless, spectrum: LineSpectrum) -> Iterable[Line]:
 
 
 def _beside_a_line(order: Order, spectrum: LineSpectrum, turn: Coordinate) -> bool:
-    """True if a stronger line is so near that the order may be its leakage."""
+    """Return True if a stronger line is so near that the order may be its leakage."""
     return any(
         abs(line.possible[TURN] - order.order) < _LEAKS_BINS * turn.resolution
         and line.amplitude > order.amplitude
@@ -266,7 +266,7 @@ def _or_image(line: Line, rate: float) -> str:
 
 
 def _feeling(scan: StudiedScan, line: Line) -> FeltLine | None:
-    """What the accelerometer feels that would be seen at this line, and is of its size."""
+    """Return what the accelerometer feels that would be seen at this line, and is of its size."""
     if scan.felt is None or TIME not in line.possible:
         return None
     seen, rate = line.possible[TIME], scan.signal.rate
@@ -300,7 +300,7 @@ def _by_feeling(scan: StudiedScan, line: Line, one: FeltLine) -> Named:
 
 
 def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
-    """What one scan says by itself: its pace changed, and the line is sharp in one kind only."""
+    """Name a line from one scan alone: its pace changed, and the line is sharp in one kind only."""
     scan, line = done.scans[key[0]], evidence.line
     kinds = {t.kind for t in evidence.tested if t.alive}
     if set(line.possible) == {PATH}:
@@ -325,7 +325,7 @@ def _alone(done: Settled, key: Key, evidence: Evidence) -> Named:
 
 
 def _with_true_frequency(scans: Sequence[StudiedScan], named: dict[Key, Named], key: Key) -> Named:
-    """A vibration whose true frequency another scan has decided."""
+    """Return a vibration whose true frequency another scan has decided."""
     own = named[key]
     if own.kind != VIBRATION or own.frequency is not None:
         return own

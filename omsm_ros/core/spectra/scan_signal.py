@@ -62,7 +62,7 @@ class ScanSignal:
         return float(np.ptp(self.turn))
 
     def coordinate(self, name: str) -> FloatArray:
-        """One of time [s], path [m], radius [m] and turn [turns], (n,)."""
+        """Return one of time [s], path [m], radius [m] and turn [turns], (n,)."""
         return np.asarray(getattr(self, name), np.float64)
 
 
@@ -148,7 +148,7 @@ def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places of the middles of stretches, and the slope of ``values`` over ``over`` there."""
+    """Return the middles of stretches, and the slope of ``values`` over ``over`` there."""
     parts = min(_STRETCHES, len(over) // 8)
     cuts = np.linspace(0, len(over), parts + 1).astype(np.int64)
     length = np.diff(cuts)
@@ -159,7 +159,7 @@ def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
-    """The longest part in which the trigger's count only rises."""
+    """Return the longest part in which the trigger's count only rises."""
     cuts = np.r_[0, np.flatnonzero(np.diff(count) <= 0) + 1, len(count)]
     longest = int(np.argmax(np.diff(cuts)))
     part = slice(cuts[longest], cuts[longest + 1])

@@ -53,7 +53,7 @@ class Change:
     changed: bool
 
     def text(self) -> str:
-        """One line for a reader."""
+        """Return one line for a reader."""
         if not self.changed:
             return f"the same ({chance(self.p_value)})"
         return (
@@ -65,7 +65,7 @@ class Change:
 
 
 def compare(old: Calibration, new: Calibration) -> Change:
-    """What changed between two calibrations of one machine, independent of each other.
+    """Return what changed between two calibrations of one machine, independent of each other.
 
     Raises CalibrationError when there is no band that both know.
     """
@@ -95,7 +95,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
 
 
 def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
-    """Frequencies (k,) [Hz] that all ``calibrations`` know well; CalibrationError if none."""
+    """Return frequencies (k,) [Hz] that all ``calibrations`` know; CalibrationError if none."""
     limits = [calibration.valid_up_to for calibration in calibrations]
     top = min(limits) * _COMPARED_PART
     if not top > _LEAST_BAND_HZ:
@@ -104,7 +104,7 @@ def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
 
 
 def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArray:
-    """Of relative gain, then phase [rad], at ``lines`` (k,) [Hz]; shape (2k, 2k).
+    """Return the covariance (2k, 2k) of relative gain, then phase [rad], at ``lines`` (k,) [Hz].
 
     That of the noise: what could hide in a step test hides in each of one machine alike, and
     does not tell two of them apart.
@@ -114,7 +114,7 @@ def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArr
 
 
 def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """χ² of ``difference`` in the directions that ``covariance`` spans, and their number."""
+    """Return χ² of ``difference`` in the directions that ``covariance`` spans, and their number."""
     scale = np.sqrt(np.diag(covariance))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -124,6 +124,6 @@ def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, 
 
 
 def gain_uncertainty(certificate: Mapping[str, object]) -> float:
-    """Standard uncertainty of the static gain [1], 0 where none is stated."""
+    """Return the standard uncertainty of the static gain [1], 0 where none is stated."""
     value = certificate.get("static_gain_uncertainty", 0.0)
     return float(value) if isinstance(value, (int, float)) else 0.0

@@ -79,12 +79,12 @@ def counter_offset(
 
 
 def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArray:
-    """Values (n,) without their mean."""
+    """Return the values (n,) without their mean."""
     return values - float(np.mean(values if ok is None else values[ok]))
 
 
 def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -> FloatArray:
-    """Share of the distance's variance that Z leaves at offsets -most … most, (2 most + 1,)."""
+    """Return the share of the distance's variance that Z leaves, by offset -most … most."""
     weight = ok.astype(np.float64)
 
     def lagged(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -101,7 +101,7 @@ def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -
 
 
 def _between(left: FloatArray) -> FloatArray:
-    """Least residual within a sample of each offset (n,): the vertex of the parabola there."""
+    """Return the least residual within a sample of each offset (n,), the vertex of a parabola."""
     before, here, after = left[:-2], left[1:-1], left[2:]
     bend, tilt = before - 2 * here + after, (after - before) / 2
     inside = (bend > 0) & (abs(tilt) <= bend)
@@ -151,7 +151,7 @@ def _refined(
 
 
 def _correlation_length(residual: FloatArray) -> float:
-    """Samples (≥ 1) that count as one, of a first-order process with this correlation."""
+    """Return samples (≥ 1) that count as one, of a first-order process with this correlation."""
     total = float(residual @ residual)
     near = float(residual[1:] @ residual[:-1]) / total if total > 0 else 0.0
     near = min(max(near, 0.0), 0.999)

@@ -56,7 +56,7 @@ class NormalEquations:
         return float(self.square + parameters @ (self.matrix @ parameters - 2 * self.right))
 
     def surface_of(self, parameters: FloatArray) -> FloatArray:
-        """Coefficients of the surface (terms,) that goes with ``parameters`` (p,)."""
+        """Return the coefficients of the surface (terms,) that goes with ``parameters`` (p,)."""
         return np.asarray(self.surface - self.shares @ parameters)
 
 

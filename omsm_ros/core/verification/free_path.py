@@ -42,7 +42,7 @@ def check_path(
     static_gain: float,
     sample_period: float,
 ) -> PathCheck:
-    """Instantaneous error and Hilbert phase lag before and after correction.
+    """Return the instantaneous error and Hilbert phase lag before and after correction.
 
     z: encoder [m];  distance: probe on a fixed target [m];  predicted: G_m z [m], all (n,)
     The probe's own view of the motion is -distance / static_gain, apart from its offset.

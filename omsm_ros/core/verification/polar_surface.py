@@ -46,16 +46,16 @@ class PolarBasis:
         return (self.outer - self.inner) / self.intervals
 
     def interval(self, radius: FloatArray) -> IntArray:
-        """Interval in which ``radius`` (n,) [m] lies, (n,)."""
+        """Return the interval in which ``radius`` (n,) [m] lies, (n,)."""
         place = ((radius - self.inner) / self.width).astype(np.int64)
         return np.asarray(np.clip(place, 0, self.intervals - 1), np.int64)
 
     def terms(self, interval: int) -> slice:
-        """Where the terms that differ from zero in ``interval`` stand among all."""
+        """Return where the terms that differ from zero in ``interval`` stand among all."""
         return slice(interval * self.waves, (interval + SUPPORT) * self.waves)
 
     def amplitudes(self, coefficients: FloatArray) -> FloatArray:
-        """Root mean square over radius of each harmonic's amplitude, from 1, (harmonics,) [m]."""
+        """Return the rms over radius of each harmonic's amplitude, from 1, (harmonics,) [m]."""
         shape = coefficients.reshape(-1, self.waves)
         middle = _SPLINES @ 0.5 ** np.arange(4)
         at_middles = sum(
@@ -84,17 +84,17 @@ class PolarRows:
     waves: FloatArray
 
     def matrix(self) -> FloatArray:
-        """Terms of one interval, (n, 4 · waves)."""
+        """Return the terms of one interval, (n, 4 · waves)."""
         product = self.splines[:, :, np.newaxis] * self.waves[:, np.newaxis, :]
         return np.asarray(product.reshape(len(self.splines), -1))
 
     def heights(self, coefficients: FloatArray) -> FloatArray:
-        """S (n,) of the surface with ``coefficients`` (4 · waves,)."""
+        """Return S (n,) of the surface with ``coefficients`` (4 · waves,)."""
         shape = coefficients.reshape(SUPPORT, -1)
         return np.asarray(np.sum(self.splines * (self.waves @ shape.T), axis=1))
 
     def derivatives(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """∂S/∂r (n,) and ∂S/∂θ (n,) of the surface with ``coefficients`` (4 · waves,)."""
+        """Return ∂S/∂r (n,) and ∂S/∂θ (n,) of the surface with ``coefficients`` (4 · waves,)."""
         shape = coefficients.reshape(SUPPORT, -1)
         along_radius = np.sum(self.slopes * (self.waves @ shape.T), axis=1)
         along_angle = np.sum(self.splines * (self.waves @ _turned(shape).T), axis=1)
@@ -102,7 +102,7 @@ class PolarRows:
 
 
 def spline_columns(place: FloatArray, intervals: int) -> FloatArray:
-    """Cubic B-splines over ``intervals`` unit intervals at ``place`` (n,), (n, intervals + 3)."""
+    """Return cubic B-splines over ``intervals`` unit intervals at ``place``, (n, intervals + 3)."""
     interval = np.clip(place.astype(np.int64), 0, intervals - 1)
     powers = (place - interval)[:, np.newaxis] ** np.arange(4)
     columns = np.zeros((len(place), intervals + SUPPORT - 1))
@@ -112,7 +112,7 @@ def spline_columns(place: FloatArray, intervals: int) -> FloatArray:
 
 
 def _turned(shape: FloatArray) -> FloatArray:
-    """Coefficients of ∂S/∂θ: (cos mθ)' = -m sin mθ, (sin mθ)' = m cos mθ."""
+    """Return the coefficients of ∂S/∂θ: (cos mθ)' = -m sin mθ, (sin mθ)' = m cos mθ."""
     harmonics = (shape.shape[1] - 1) // 2
     order = np.arange(1, harmonics + 1)
     cosines, sines = shape[:, 1 : harmonics + 1], shape[:, harmonics + 1 :]

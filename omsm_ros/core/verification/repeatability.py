@@ -58,7 +58,7 @@ class Repeatability:
     repeatable: bool
 
     def text(self) -> str:
-        """One line for a reader."""
+        """Return one line for a reader."""
         verdict = "as repeatable as stated" if self.repeatable else "scatter more than they state"
         lag, gain = self.delay, self.static_gain
         return (
@@ -73,7 +73,7 @@ def _of_stated(spread: Spread) -> str:
 
 
 def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
-    """Scatter of independent ``calibrations`` of one machine against their uncertainties.
+    """Compare the scatter of independent ``calibrations`` of one machine with their uncertainty.
 
     χ² sums the squared deviations from the mean, in the directions of the response that the
     mean covariance knows, and of the static gain where its uncertainty is stated.
@@ -122,7 +122,7 @@ def _spread(values: Sequence[float], uncertainties: Sequence[float]) -> Spread:
 
 
 def _chance(off: FloatArray, covariance: FloatArray, static_gain: Spread) -> float:
-    """p-value of deviations from the mean, of the response ``off`` (n, 2k) and the gain."""
+    """Return p-value of deviations from the mean, of the response ``off`` (n, 2k) and the gain."""
     free = len(off) - 1
     found = [mahalanobis(row, covariance) for row in off]
     statistic, known = sum(value for value, _ in found), found[0][1] * free

@@ -153,7 +153,7 @@ def from_scans_alone(
 def _moved(
     calibration: Calibration, lag: float, curvature: float
 ) -> tuple[TransferFunction, FloatArray]:
-    """G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
+    """Return G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
 
     Only the numerator changes, so the poles stay where they are. It grows to the first degree
     where the denominator allows it, to hold the lag, and no further, to stay a small model.
@@ -244,7 +244,7 @@ def untold(found: SelfCalibration) -> list[str]:
 
 
 def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:
-    """The certificate with the scans' own reasons for and against."""
+    """Return the certificate with the scans' own reasons for and against."""
     reasons = []
     if not found.agreement.holds:
         reasons.append(
@@ -275,7 +275,7 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
 
 
 def _highest_excited(found: SelfCalibration) -> float:
-    """Highest frequency [Hz] at which the surface shows a response off by the usual limits."""
+    """Return the highest frequency [Hz] at which the surface shows G off by the usual limits."""
     known = found.agreement.noise * np.sqrt(2 / found.points)
     limits = ResponseLimits()
     excited = found.amplitudes * min(limits.gain, limits.phase) > COVERAGE_FACTOR * known
@@ -284,7 +284,7 @@ def _highest_excited(found: SelfCalibration) -> float:
 
 
 def _inverse_of_what_varies(matrix: FloatArray) -> FloatArray:
-    """Inverse of a covariance (2, 2) whose rows have different units and may be zero."""
+    """Return the inverse of a covariance (2, 2) whose rows have different units and may be zero."""
     deviation = np.sqrt(np.diag(matrix))
     scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
     correlation = matrix * scale * scale[:, np.newaxis]

@@ -62,11 +62,11 @@ class RingScores:
             self.agreement.add(int(k), radius[mine], angle[mine], residual[mine])
 
     def meat(self) -> FloatArray:
-        """Covariance of the scores, (parameters, parameters); a ring varies as a whole."""
+        """Return the scores' covariance, (parameters, parameters); a ring varies as a whole."""
         rings = len(self._scores)
         return np.asarray(self._scores.T @ self._scores * (rings / (rings - 1)))
 
     def followed(self, covariance: FloatArray) -> float:
-        """Standard uncertainty of the heights by the four parameters, rms over all points [m]."""
+        """Return the rms standard uncertainty of the heights by the four parameters [m]."""
         mean_square = float(np.sum(self._second * covariance)) / len(self._model)
         return float(np.sqrt(max(mean_square, 0.0)))

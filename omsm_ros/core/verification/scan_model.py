@@ -94,7 +94,7 @@ class ScanModel:
         return [-float(np.median(rate[self.scan == k])) for k in range(self.number)]
 
     def own(self, scan: int) -> slice:
-        """Where clocking, shift and tilt of ``scan`` (1, 2, …) stand among the parameters."""
+        """Return where clocking, shift and tilt of ``scan`` (1, 2, …) are among the parameters."""
         begin = DYNAMIC + sum(len(OWN) + self._drifts[k].size for k in range(1, scan))
         return slice(begin, begin + len(OWN))
 
@@ -104,11 +104,11 @@ class ScanModel:
         return int(self.own(self.number).start)
 
     def radius(self, part: Portion) -> FloatArray:
-        """Of the points of ``part`` [m]."""
+        """Return the radius of the points of ``part`` [m]."""
         return np.asarray(self._column["radius"][part.points])
 
     def angle(self, part: Portion) -> FloatArray:
-        """Of the points of ``part`` on the part [rad]."""
+        """Return the angle of the points of ``part``, on the part [rad]."""
         return np.asarray(self._column["angle"][part.points])
 
     def portions(self, place: Place, every: int) -> Iterator[Portion]:

@@ -156,7 +156,7 @@ def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:
 
 
 def _runs(blocks: list[AxisBlock]) -> list[list[AxisBlock]]:
-    """The blocks in groups of which each follows the one before."""
+    """Return the blocks in groups of which each follows the one before."""
     runs: list[list[AxisBlock]] = []
     for block in blocks:
         if runs and block.first_sample == _end(runs[-1][-1]):

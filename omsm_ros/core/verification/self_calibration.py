@@ -175,7 +175,7 @@ class _Fit:
         self._iterate()
 
     def without(self, index: int) -> _Fit:
-        """The same fit with one of the four left as it is, for the scans cannot tell it."""
+        """Return the same fit with one of the four left as it is, for the scans cannot tell it."""
         covariance = _held(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
         return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
@@ -225,7 +225,7 @@ class _Fit:
         self._place = Place(float(parameters[LATENCY]), np.array([0.0, *clocking]))
 
     def result(self) -> SelfCalibration:
-        """Residuals, covariance by rings, and what is said of the scans."""
+        """Return the residuals, covariance by rings, and what is said of the scans."""
         self._step(every=1)
         model, parameters = self._model, self._parameters
         seen = RingScores(model, self._equations.shares)
@@ -262,7 +262,7 @@ class _Fit:
         )
 
     def _by_gain(self, inverse: FloatArray) -> FloatArray:
-        """What an uncertain gain adds to the covariance, (parameters, parameters).
+        """Return what an uncertain gain adds to the covariance, (parameters, parameters).
 
         It is not estimated: on a surface that Z follows it shows in third order of the following
         error only, where other terms that are not modelled show too.
@@ -275,7 +275,7 @@ class _Fit:
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """Of a positive matrix whose rows have different units."""
+    """Return the inverse of a positive matrix whose rows have different units."""
     scale = 1 / np.sqrt(np.diag(matrix))
     return np.asarray(
         scale[:, np.newaxis] * linalg.inv(matrix * scale * scale[:, np.newaxis]) * scale
@@ -283,7 +283,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _precision(model: ScanModel, prior: Prior) -> FloatArray:
-    """Inverse of the prior's covariance, (parameters, parameters)."""
+    """Return the inverse of the prior's covariance, (parameters, parameters)."""
     precision = np.eye(model.size) / _FREE**2
     four = slice(DYNAMIC)
     precision[four, four] = _inverse(prior.covariance + np.diag(_FLOOR**2))
@@ -296,7 +296,7 @@ def _precision(model: ScanModel, prior: Prior) -> FloatArray:
 
 
 def _held(covariance: FloatArray, index: int) -> FloatArray:
-    """The same with one quantity at its value."""
+    """Return the same with one quantity at its value."""
     held = covariance.copy()
     held[index], held[:, index] = 0.0, 0.0
     return held
@@ -305,7 +305,7 @@ def _held(covariance: FloatArray, index: int) -> FloatArray:
 def _surprise(
     values: FloatArray, prior: FloatArray, inverse: FloatArray, covariance: FloatArray
 ) -> float:
-    """χ² of lag and curvature against what was known before.
+    """Return χ² of lag and curvature against what was known before.
 
     values: (2,);  prior: (2, 2);  inverse, covariance: of the normal matrix with the prior in it,
         and by rings, (2, 2)

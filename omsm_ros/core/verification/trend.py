@@ -18,7 +18,7 @@ FEWEST = 5
 
 
 def outliers(values: FloatArray) -> BoolArray:
-    """True for each of ``values`` (n,) that lies far from the others; NaN never does.
+    """Return True for each of ``values`` (n,) that lies far from the others; NaN never does.
 
     By the modified z-score ``0.6745 |v − median| / MAD`` > 3.5. Of fewer than five nothing is
     said; where half the values are equal, every other one stands out by its mean deviation.
