@@ -6,7 +6,7 @@ import numpy as np
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.recursion import through
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
@@ -14,8 +14,6 @@ from omsm_ros.core.verification.free_path import PathCheck, check_path
 from omsm_ros.jobs.identify_bag import motion_of_bag
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage.recording.topics import AnyBag
-
-_START_SAMPLES = 12
 
 
 def path_check_of(
@@ -29,12 +27,11 @@ def path_check_of(
     trigger: what is stated of the counters of axes and distance
     """
     record = motion_of_bag(path, trigger=trigger, progress=progress)
-    recursion = Recursion(discretise(calibration.dynamics, record.sample_period))
-    recursion.start(past_motion(record.z[:_START_SAMPLES]))
+    predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     return check_path(
         record.z,
         _bridged(record),
-        recursion.run(record.z),
+        predicted,
         calibration.static_gain,
         record.sample_period,
     )

@@ -233,12 +233,12 @@ def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     """Bit for bit, whatever was between: messages, DDS, blocks."""
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
     from omsm_ros.core.correction.surface_points import join_points, pack_points
-    from omsm_ros.core.correction.uncertainty import sources_with
+    from omsm_ros.core.correction.uncertainty import ErrorSources
 
     cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
     feed = Feed(cell)
     pairs = blocks_of(small_scan)[:30]
-    options = CorrectionOptions(sources=sources_with(true_calibration, {}))
+    options = CorrectionOptions(sources=ErrorSources.of(true_calibration))
     corrector = Corrector(true_calibration, options)
     parts = []
     for axes, distance in pairs:

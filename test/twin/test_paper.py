@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.aliasing import folded_frequency, sampling_distance
+from omsm_ros.core.dynamics.aliasing import folded_frequency
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.trajectories import Spiral, StepTest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
@@ -105,11 +105,6 @@ def test_680_hz_folds_to_320_hz():
     assert folded_frequency(680, 1000) == 320
     # Halves round up: 500 Hz stays where it is, as does its mirror image.
     np.testing.assert_array_equal(folded_frequency([500, 1500, 1000, 60], 1000), [500, 500, 0, 60])
-
-
-@pytest.mark.parametrize(("rpm", "micrometres"), [(1.875, 4.241), (15, 33.930), (30, 67.861)])
-def test_sampling_distance_of_table_1(rpm, micrometres):
-    assert sampling_distance(21.6e-3, rpm, 1000) * 1e6 == pytest.approx(micrometres, rel=5e-5)
 
 
 def test_chirp_of_figure_9():

@@ -12,10 +12,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import PROBE, Calibration
+from omsm_ros.core.samples.blocks import SAME_PERIOD
 from omsm_ros.errors import CalibrationError
 
-# Quartz clocks agree to some 1e-5; a rate is written, not measured, and differs by rounding alone.
-SAME_RATE = 1e-6
 # Settings are written by people or read back as float32.
 _SAME_VALUE = 1e-6
 
@@ -38,7 +37,7 @@ def objections(
     """
     found = [*_certificate(calibration, polarity)]
     expected = calibration.sample_period
-    if sample_period is not None and abs(sample_period - expected) > SAME_RATE * expected:
+    if sample_period is not None and abs(sample_period - expected) > SAME_PERIOD * expected:
         found.append(f"sample period is {sample_period!r} s, calibrated at {expected!r} s")
     if settings is not None:
         stated = {n: v for n, v in calibration.settings.items() if not n.startswith(PROBE)}

@@ -109,7 +109,7 @@ class MachineSources:
         return tuple(stated for stated in self.stated if stated.source == name)
 
     def of_points(self) -> dict[str, float]:
-        """Return standard uncertainties of single points by name, for ``sources_with``."""
+        """Return standard uncertainties of single points, fields of ``ErrorSources`` by name."""
         return {
             stated.source: stated.standard_uncertainty
             for stated in self.stated

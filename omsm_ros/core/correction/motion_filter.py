@@ -22,7 +22,7 @@ from omsm_ros.core.correction.uncertainty import (
 )
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
-from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.recursion import START_SAMPLES, Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.accounts import Reason
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -30,8 +30,6 @@ from omsm_ros.core.samples.pairing import Run
 
 # The share of a wrong start that may be left in the first published point.
 SETTLED = 1e-6
-# A parabola through twelve has 0.74 of one sample's noise at its end, through five 0.94.
-_MIN_START_SAMPLES = 12
 _X, _Y, _Z, _B, _C = range(5)
 _LATERAL = (_X, _Y, _B, _C)
 Past = Callable[[FloatArray], FloatArray]
@@ -197,7 +195,7 @@ class MotionFilter:
         lateral = filters[0].lateral
         self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
         settling = max(each.settling_samples() for each in filters)
-        self._start_samples = max(settling // 2, _MIN_START_SAMPLES)
+        self._start_samples = max(settling // 2, START_SAMPLES)
         self._settling = max(settling, self._start_samples)
         self._unsettled = self._settling
         self._next: tuple[int, int] | None = None

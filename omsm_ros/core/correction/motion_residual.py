@@ -20,11 +20,9 @@ from omsm_ros.core.correction.uncertainty import (
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import DigitalFilter, discretise
 from omsm_ros.core.dynamics.discretisation_error import fast_length
-from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.recursion import START_SAMPLES, Recursion, through
 from omsm_ros.core.samples.blocks import FloatArray
 
-# As few as a parabola through noisy samples allows; the motion has hardly bent meanwhile.
-START_SAMPLES = 12
 # The band that counts as trusted ends between these shares of the frequency of trust.
 _PASSED_SHARE = 0.8
 # A millimetre of travel through the stop band is then ten nanometres, of which 1 - G passes.
@@ -33,19 +31,12 @@ _ATTENUATION_DB = 100.0
 _RUNNING_S = 0.1
 
 
-def residual_over_time(calibration: Calibration, z: FloatArray, sample_period: float) -> FloatArray:
-    """Return the standard uncertainty of G z that the correction leaves [m], at most (n,).
+class Residual:
+    """What the correction leaves of motions sampled every ``sample_period`` [s].
 
     Within the trusted band it is that of the calibration's covariance, and above it the whole
     (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
     it at either, the motion above the band is taken to be as large as next to them.
-    """
-    known, hidden = Residual(calibration, sample_period).variances(z)
-    return np.asarray(np.sqrt(known + hidden))
-
-
-class Residual:
-    """What the correction leaves of motions sampled every ``sample_period`` [s].
 
     To design its filters takes as long as to run them over a stretch, so all stretches share them.
     """
@@ -60,7 +51,10 @@ class Residual:
         ]
 
     def variances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the variance of the residual [m²] but for what could hide, and that of it."""
+        """Return the variances of the residual of ``z`` (n,) [m²], each at most (n,).
+
+        The first is of all but what could hide in the step test, the second of that.
+        """
         noise, hidden = (self._variance(*part, z) for part in self._parts)
         known = noise + self._linear
         known += _missed_beyond(self._trusted, self._digital, z)
@@ -87,13 +81,6 @@ class Residual:
             recursion.start(before)
             variance += recursion.run(z) ** 2
         return variance
-
-
-def through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
-    """Return the filter's response to ``z`` (n,), which comes out of a steady motion."""
-    recursion = Recursion(digital)
-    recursion.start(past_motion(z[:START_SAMPLES]))
-    return recursion.run(z)
 
 
 def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:

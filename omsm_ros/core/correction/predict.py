@@ -14,15 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.motion_filter import SETTLED
-from omsm_ros.core.correction.motion_residual import (
-    START_SAMPLES,
-    Residual,
-    running_mean,
-    through,
-)
+from omsm_ros.core.correction.motion_residual import Residual, running_mean
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import checked_motion, velocity_spectrum
+from omsm_ros.core.dynamics.recursion import START_SAMPLES, through
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.limits import (
     FASTEST,

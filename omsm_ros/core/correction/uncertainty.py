@@ -92,18 +92,6 @@ class ErrorSources:
         )
 
 
-def sources_with(calibration: Calibration, stated: Mapping[str, object]) -> ErrorSources:
-    """Return the sources that the calibration states, replaced by those ``stated`` by name.
-
-    Raises ConfigurationError for a name that is no source, or a value that is no uncertainty.
-    """
-    known = [field.name for field in fields(ErrorSources)]
-    for name in stated:
-        if name not in known:
-            raise ConfigurationError(f"uncertainty {name!r} is unknown, expected of {known}")
-    return replace(ErrorSources.of(calibration), **stated)  # type: ignore[arg-type]
-
-
 def _standard_uncertainty(certificate: Mapping[str, object], key: str) -> float:
     return float(UNCERTAINTY.checked(certificate.get(key, 0.0), CalibrationError, key))
 

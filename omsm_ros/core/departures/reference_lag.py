@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.fitting.steps import LEAST_SAMPLES
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.least_squares import unit_columns
-
-# Interpolation at a lost reading is no reading: so many neighbours of it are left out.
-_LEAST_SAMPLES = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +29,7 @@ def reference_lag(record: MotionRecord) -> ReferenceLag | None:
     known = np.isfinite(record.reference)
     if record.z_lost is not None:
         known &= ~record.z_lost
-    if np.sum(known) < _LEAST_SAMPLES:
+    if np.sum(known) < LEAST_SAMPLES:
         return None
     columns = np.column_stack(
         [

@@ -93,24 +93,24 @@ class ResidualSpace:
         compared = columns[self.problem.used]
         freed = self.freed(columns)
         before = np.linalg.norm(compared, axis=0)
-        told = np.linalg.norm(freed, axis=0) > _IMITATED * np.where(before > 0, before, 1.0)
+        free = np.linalg.norm(freed, axis=0) > _IMITATED * np.where(before > 0, before, 1.0)
         terms = columns.shape[1]
         size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
-        if not np.any(told):
+        if not np.any(free):
             return Score(size, covariance, 0.0, 0)
-        unit = np.linalg.norm(freed[:, told], axis=0)
-        inverse = np.linalg.pinv(freed[:, told] / unit, rcond=_IMITATED)
+        unit = np.linalg.norm(freed[:, free], axis=0)
+        inverse = np.linalg.pinv(freed[:, free] / unit, rcond=_IMITATED)
         found = inverse @ self.fitted.residual
-        left = self.fitted.residual - freed[:, told] / unit @ found
-        spread = self._covariance(inverse, left)
+        residual = self.fitted.residual - freed[:, free] / unit @ found
+        spread = self._covariance(inverse, residual)
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
-        size[told] = found / unit
-        covariance[np.ix_(told, told)] = spread / np.outer(unit, unit)
+        size[free] = found / unit
+        covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
         degrees = int(np.linalg.matrix_rank(inverse, tol=None))
         return Score(size, covariance, chi_square, degrees)
 
-    def _covariance(self, inverse: FloatArray, left: FloatArray) -> FloatArray:
-        """Return the covariance (c, c) of ``inverse`` (c, k) times noise coloured as ``left``."""
+    def _covariance(self, inverse: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the covariance (c, c) of ``inverse`` (c, k) times noise like ``residual`` (k,)."""
         used = self.problem.used
         length = fft.next_fast_len(len(used), real=True)
         rows = np.zeros((len(inverse), len(used)))
@@ -120,23 +120,23 @@ class ResidualSpace:
         weight[0] = 1.0
         if length % 2 == 0:
             weight[-1] = 1.0
-        noise = broad_noise(left, np.flatnonzero(used), len(used), length)
+        noise = broad_noise(residual, np.flatnonzero(used), len(used), length)
         uneven = uneven_rows(self.problem, inverse.T, self.fitted.residual)
         lost = self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
         from_noise = np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length
         return np.asarray(from_noise + uneven.T @ uneven)
 
 
-def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
-    """Return the variance spectrum of a residual ``left`` (k,) at ``length`` // 2 + 1 frequencies.
+def broad_noise(residual: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
+    """Return the variance spectrum of ``residual`` (k,) at ``length`` // 2 + 1 frequencies.
 
     place: index of each among ``samples``
     The larger of an autoregressive one, which misses slow drift, and of the periodogram
     smoothed over an octave, which does not.
     """
     on_grid = np.zeros(samples)
-    on_grid[place] = left
-    power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(left)
+    on_grid[place] = residual
+    power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(residual)
     line = np.arange(len(power))
     low = np.minimum(line / _HALF_WIDTH, line - _LEAST_LINES / 2).astype(int)
     low = np.clip(low, 1, max(len(power) - _LEAST_LINES, 1))
@@ -144,4 +144,4 @@ def broad_noise(left: FloatArray, place: IntArray, samples: int, length: int) ->
     high = np.minimum(high, len(power))
     total = np.concatenate([[0.0], np.cumsum(power)])
     smooth = (total[high] - total[low]) / np.maximum(high - low, 1)
-    return np.asarray(np.maximum(smooth, noise_spectrum(left, length)))
+    return np.asarray(np.maximum(smooth, noise_spectrum(residual, length)))

@@ -19,11 +19,3 @@ def folded_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
         raise DataError(f"sample_rate {sample_rate!r} Hz is not positive")
     f = np.asarray(frequency, np.float64)
     return np.abs(f - sample_rate * np.floor(f / sample_rate + 0.5))
-
-
-def sampling_distance(radius: float, spindle_speed: float, sample_rate: float) -> float:
-    """Return the distance along the track between two samples [m].
-
-    radius: of the track [m];  spindle_speed: [rpm];  sample_rate: [Hz]
-    """
-    return 2 * np.pi * abs(radius * spindle_speed) / 60 / sample_rate

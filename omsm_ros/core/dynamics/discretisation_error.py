@@ -7,11 +7,9 @@ the samples hold the encoder's noise rather than the motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discretise
+from omsm_ros.core.dynamics.discretisation import DigitalFilter
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
@@ -24,23 +22,6 @@ _FADE = 0.1
 _BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
 # A motion that fills more of the Nyquist band is not resolved by its samples.
 _RESOLVED_SHARE = 0.2
-# Up to the highest that there is, whose noise gain is 1.3 for the paper's dynamics.
-ORDERS = (1, 2, 3, 4, 5, 7)
-
-
-@dataclass(frozen=True)
-class Audit:
-    """One way to discretise, judged on a motion.
-
-    method: "bilinear" or "polynomial k";  order: k, None for bilinear
-    rms, peak_to_valley: of (H - G) z within the band [m];  noise_gain: of H for white noise [1]
-    """
-
-    method: str
-    order: int | None
-    rms: float
-    peak_to_valley: float
-    noise_gain: float
 
 
 def checked_motion(z: FloatArray) -> FloatArray:
@@ -123,21 +104,3 @@ def discretisation_error(
     over_time = np.fft.irfft(error * amplitude, padded)[:samples]
     fade = int(_FADE * samples) + 1
     return rms, float(np.ptp(over_time[fade:-fade]))
-
-
-def audit(
-    dynamics: TransferFunction, sample_period: float, z: FloatArray, up_to: float
-) -> tuple[Audit, ...]:
-    """Return every method judged on the motion ``z`` (n,) [m], the least error first."""
-    filters: list[tuple[str, int | None, DigitalFilter]] = [
-        (f"polynomial {order}", order, discretise(dynamics, sample_period, order))
-        for order in ORDERS
-    ]
-    if dynamics.delay == 0:
-        trapezoid = bilinear(dynamics, sample_period)
-        filters.append(("bilinear", None, trapezoid))
-    judged = [
-        Audit(name, order, *discretisation_error(dynamics, digital, z, up_to), digital.noise_gain)
-        for name, order, digital in filters
-    ]
-    return tuple(sorted(judged, key=lambda a: a.rms))

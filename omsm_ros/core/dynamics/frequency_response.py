@@ -1,4 +1,4 @@
-"""What frequencies a signal holds, and how one signal answers another, without a model."""
+"""How does one signal answer another? Estimated without a model."""
 
 from __future__ import annotations
 
@@ -9,41 +9,6 @@ from scipy import signal
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.errors import DataError
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """One-sided power spectral density, each (k,): frequency [Hz], density [unit²/Hz]."""
-
-    frequency: FloatArray
-    density: FloatArray
-
-    def rms_between(self, low: float, high: float) -> float:
-        """Return the rms of the content from ``low`` to ``high`` [Hz], in the signal's unit."""
-        inside = (self.frequency >= low) & (self.frequency <= high)
-        step = self.frequency[1] - self.frequency[0]
-        return float(np.sqrt(np.sum(self.density[inside]) * step))
-
-    def strongest(self) -> float:
-        """Return the frequency [Hz] of the greatest density above zero frequency."""
-        return float(self.frequency[1:][np.argmax(self.density[1:])])
-
-
-def power_spectrum(values: FloatArray, sample_period: float, segment: int = 1024) -> Spectrum:
-    """Return Welch's estimate of ``values`` (n,), the mean of each segment removed.
-
-    Raises DataError for fewer than eight samples or one that is not finite.
-    """
-    if len(values) < 8 or not np.all(np.isfinite(values)):
-        raise DataError(
-            f"spectrum of {len(values)!r} samples, {int(np.sum(~np.isfinite(values)))!r} of them "
-            "not finite: at least 8 finite samples are needed"
-        )
-    frequency, density = signal.welch(
-        values, 1 / sample_period, nperseg=min(segment, len(values)), detrend="constant"
-    )
-    return Spectrum(frequency, density)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ def uneven_rows(problem: Problem, columns: FloatArray, residual: FloatArray) -> 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
     """Return the variance [s²] of the time of a reading that ``residual`` (k,) shows.
 
-    None where rounding is larger than noise: that too scatters where the axis moves only.
+    0 where rounding is larger than noise: that too scatters where the axis moves only.
     """
     if problem.shared > 0:
         return 0.0

@@ -18,8 +18,6 @@ uncertainty of the figure.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap, Figure, weighted_quantiles
@@ -37,8 +35,6 @@ _ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws know a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
-
-Extent = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def rms_of_part(map_: DeviationMap) -> Figure:

@@ -16,6 +16,7 @@ from omsm_ros.core.dynamics.response_band import (
 )
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import gain_uncertainty_alone
+from omsm_ros.core.identification.covariance_terms import HARMLESS_DELAY_S
 from omsm_ros.core.identification.departure_checks import agreement, departures, independence
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
@@ -29,8 +30,6 @@ _LEAST_CHI_SQUARE = 0.3
 _LEAST_TRUSTED_HZ = 5.0
 # Standard uncertainties beyond which a lead is no chance.
 _CLEARLY = 5.0
-# Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms).
-_HARMLESS_DELAY_S = 7e-6
 
 
 def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Finding:
@@ -75,7 +74,7 @@ def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: floa
     encoder_noise, probe_noise: standard deviation of a reading [m]
     An encoder may be late, and a scan is late by the same. But the noisier channel is the probe.
     """
-    if lag > -max(_CLEARLY * uncertainty, _HARMLESS_DELAY_S):
+    if lag > -max(_CLEARLY * uncertainty, HARMLESS_DELAY_S):
         return Finding()
     early = f"the probe moves {quantity(-lag, 's')} before the encoder"
     if encoder_noise > probe_noise:

@@ -23,8 +23,9 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.readable import quantity
 
-# Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms). The band holds all of it.
-_HARMLESS_DELAY_S = 7e-6
+HARMLESS_DELAY_S = 7e-6
+"""Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms)."""
+
 # A nanometre and a half on the paper's scan, whose Z moves at 0.7 mm/s (rms).
 _GREATEST_REFERENCE_LAG_S = 2e-6
 # Standard uncertainties beyond which a lag is no chance.
@@ -56,7 +57,7 @@ def hidden_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> Covar
 def hidden_motion_finding(bound: float, delay_noise: float) -> Finding:
     """Reject edges whose bound on the bias of the delay [s] exceeds its noise [s]."""
     reasons: tuple[str, ...] = ()
-    if bound > max(delay_noise, _HARMLESS_DELAY_S):
+    if bound > max(delay_noise, HARMLESS_DELAY_S):
         reasons = (
             f"motion between samples may shift the lag by {quantity(bound, 's')}: the edges are "
             "too sharp for the sampling; use jerk-limited or dithered edges, or sample faster",

@@ -37,14 +37,13 @@ _FINEST_READING_M = 1e-10
 class ResidualTests:
     """chi_square: mean square where the axis moves over that of noise;  noise: [m]
     timing: standard deviation of the time of a reading [s], 0 where it does not show
-    whiteness, independence: p-values, small where the residual is coloured or follows the motion
+    whiteness: p-value, small where the residual is coloured
     """
 
     chi_square: float
     noise: float
     timing: float
     whiteness: float
-    independence: float
 
 
 def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests:
@@ -71,7 +70,6 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
         noise,
         float(np.sqrt(timing)),
         whiteness(fitted.residual),
-        independence(fitted.residual, np.gradient(problem.input)[problem.used]),
     )
 
 

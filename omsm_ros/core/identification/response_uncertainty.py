@@ -24,7 +24,7 @@ from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.model_choice import Model
 from omsm_ros.core.samples.blocks import FloatArray
 
-# On a logarithmic grid over three decades: neighbours 2 % apart, finer than any limit of the band.
+# On a logarithmic grid over four decades: neighbours 2.3 % apart.
 _FREQUENCIES = 400
 # Kass and Raftery: a difference in BIC above this is very strong evidence.
 _EQUALLY_GOOD_BIC = 10.0

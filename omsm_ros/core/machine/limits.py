@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.dynamics.recursion import Recursion, past_motion
+from omsm_ros.core.dynamics.recursion import through
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
@@ -32,8 +32,6 @@ _CONTENT_SHARE = 0.999
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
 # so many samples, so that the encoder's noise stays below the path.
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
-# As for the corrector: a parabola through the first samples is the past.
-_START_SAMPLES = 12
 
 _DECLARED = Quantity("limit", "", 1e-12, 1e12, "give it in the unit of its name")
 
@@ -293,11 +291,10 @@ def following_error(
     if dynamics is not None:
         both = np.asarray(np.convolve(motion.denominator, dynamics.denominator), np.float64)
         motion = TransferFunction(dynamics.numerator, both, dynamics.delay)
-    recursion = Recursion(discretise(motion, sample_period / factor))
-    recursion.start(past_motion(z[:_START_SAMPLES]))
+    moved = through(discretise(motion, sample_period / factor), z)
     # The past before the first sample is guessed; its response is over after ten time constants.
     settling = min(int(10 / omega / (sample_period / factor)), len(z) // 2)
-    return float(np.max(np.abs(z - recursion.run(z))[settling:]))
+    return float(np.max(np.abs(z - moved)[settling:]))
 
 
 def _following(

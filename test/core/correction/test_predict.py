@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import interpolate, signal
 
-from omsm_ros.core.correction.motion_residual import residual_over_time
+from omsm_ros.core.correction.motion_residual import Residual
 from omsm_ros.core.correction.predict import (
     Prediction,
     dynamic_error,
@@ -192,8 +192,8 @@ def test_residual_is_the_error_of_a_wrong_calibration(path) -> None:
     calibration = late_probe(lag_uncertainty=off)
     wrong = replace(calibration.dynamics, delay=calibration.dynamics.delay + off)
     difference = dynamic_error(wrong, z, PERIOD) - dynamic_error(calibration.dynamics, z, PERIOD)
-    stated = residual_over_time(calibration, z, PERIOD)
-    assert np.max(stated) == pytest.approx(np.max(np.abs(difference)), rel=0.02)
+    stated = Residual(calibration, PERIOD).largest(z)
+    assert stated == pytest.approx(np.max(np.abs(difference)), rel=0.02)
 
 
 @pytest.mark.parametrize("path", [spiral, raster, constant_surface_speed])
@@ -203,8 +203,7 @@ def test_a_speed_called_safe_stays_within_the_budget(path) -> None:
     factor = predicted(calibration, z).speed_factor
     assert 1 < factor < FASTEST
     for speed, safe in ((0.98 * factor, True), (1.05 * factor, False)):
-        faster = ScanPath(z=z, sample_period=PERIOD / speed)
-        assert (np.max(residual_over_time(calibration, z, faster.sample_period)) < 25e-9) == safe
+        assert (Residual(calibration, PERIOD / speed).largest(z) < 25e-9) == safe
 
 
 def test_the_limit_that_binds_is_the_headline() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.motion_residual import residual_over_time
+from omsm_ros.core.correction.motion_residual import Residual
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -125,5 +125,5 @@ def test_uncertainty_of_a_sine_is_the_open_share_of_its_swing(phase):
 
 def test_the_prediction_says_the_same():
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
-    residual = residual_over_time(calibration(), z, PERIOD)
+    residual = np.sqrt(np.sum(Residual(calibration(), PERIOD).variances(z), axis=0))
     assert np.max(residual[-10_000:]) == pytest.approx(OPEN * AMPLITUDE, rel=0.02)

@@ -15,7 +15,6 @@ from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
     contributions,
     sensitivity_filters,
-    sources_with,
     with_lateral,
 )
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -274,21 +273,6 @@ def test_the_certificate_tells_noise_and_gain() -> None:
 def test_a_senseless_uncertainty_is_named(name: str, value: float) -> None:
     with pytest.raises(ConfigurationError, match=name):
         ErrorSources(**{name: value})
-
-
-class TestStatedSources:
-    def test_take_the_place_of_what_the_certificate_says(self, true_calibration):
-        calibration = replace(true_calibration, certificate={"noise_m": 1e-8})
-        sources = sources_with(calibration, {"encoder_noise": 4e-10, "pitch": 1e-6})
-        assert (sources.probe_noise, sources.encoder_noise, sources.pitch) == (1e-8, 4e-10, 1e-6)
-
-    @pytest.mark.parametrize(
-        ("stated", "named"),
-        [({"humidity": 1.0}, "humidity"), ({"pitch": "1 nm"}, "1 nm"), ({"pitch": -1.0}, "pitch")],
-    )
-    def test_nonsense_is_refused_by_name(self, true_calibration, stated, named):
-        with pytest.raises(ConfigurationError, match=named):
-            sources_with(true_calibration, stated)
 
 
 def test_what_nobody_stated_is_no_source():

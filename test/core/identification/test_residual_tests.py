@@ -68,7 +68,6 @@ def test_a_right_model_leaves_noise_and_a_known_noise_is_taken():
     assert tests.noise == pytest.approx(1e-8, rel=0.05)
     assert tests.chi_square == pytest.approx(1.0, abs=0.2)
     assert tests.whiteness > 1e-3
-    assert tests.independence > 1e-3
 
 
 def test_a_wrong_model_shows_where_the_axis_moves():
@@ -76,7 +75,6 @@ def test_a_wrong_model_shows_where_the_axis_moves():
     static = fit(problem, Structure(0, 0, False), [np.empty(0)])
     tests = residual_tests(problem, static, steps)
     assert tests.chi_square > 5
-    assert tests.independence < 1e-9
 
 
 @pytest.mark.parametrize("noise", [0.5e-9, 1.5e-9])
