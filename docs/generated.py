@@ -10,6 +10,7 @@ import yaml
 
 from omsm_ros import quantities
 from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.words import WORDS
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -31,7 +32,7 @@ def write(folder: Path) -> None:
 
 def commands() -> str:
     """Return a section for each word after ``omsm``, with its arguments."""
-    parser = parser_of("")
+    parser = parser_of(WORDS)
     (words,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     lines = ["# Commands", "", "Exit status: 0 done, 2 bad input, 70 a defect of ours.", ""]
     for name, sub in words.choices.items():

@@ -198,16 +198,16 @@ print(json.dumps({
 
 
 def test_an_offline_command_is_added_in_cli(tmp_path):
-    """A module with COMMANDS, and its words: help, --json and exit status come with it."""
+    """A module with COMMANDS, and a row of its word: help, --json and exit status follow."""
     run = changed_copy(
         tmp_path,
-        "cli/main.py",
-        ("WORDS = {\n", 'WORDS = {\n    "omsm_ros.cli.weighing": ("weigh",),\n'),
+        "cli/words.py",
+        ('"begin": {\n', '"begin": {\n        "weigh": Word("weighing", "what it weighs"),\n'),
     )
     (tmp_path / "omsm_ros" / "cli" / "weighing.py").write_text(
         "from omsm_ros.cli.command import Command\n"
         "def declare(parser):\n    parser.add_argument('grams', type=float)\n"
-        "COMMANDS = [Command('weigh', 'what it weighs', declare,\n"
+        "COMMANDS = [Command('weigh', declare,\n"
         "    lambda args: {'kg': args.grams / 1000}, print)]\n"
     )
     main = "from omsm_ros.cli.main import main; sys.exit(main(sys.argv[1:]))"

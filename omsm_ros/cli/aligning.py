@@ -79,7 +79,6 @@ def _show_align(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "align",
-        "spindle centre and beam direction from a scan of a reference sphere",
         _declare_align,
         _align,
         _show_align,

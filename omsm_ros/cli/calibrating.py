@@ -249,24 +249,21 @@ def _show_calset(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("plan", "write a step test for the machine", _declare_plan, _plan, _show_plan),
+    Command("plan", _declare_plan, _plan, _show_plan),
     Command(
         "verify",
-        "check a calibration on a free path: errors and phase lags before and after",
         _declare_verify,
         _verify,
         _show_verify,
     ),
     Command(
         "compare",
-        "has the machine changed between two calibrations? Do three or more repeat?",
         _declare_compare,
         _compare,
         lambda facts: print(facts["text"]),
     ),
     Command(
         "calset",
-        "calibrations along X, Z or B as one, for dynamics that vary",
         _declare_calset,
         _calset,
         _show_calset,

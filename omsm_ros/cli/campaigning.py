@@ -96,7 +96,6 @@ def _undone(facts: Facts) -> str:
 COMMANDS = [
     Command(
         "batch",
-        "correct every bag of a folder; an index page with outliers and trends",
         _declare_batch,
         _batch,
         _show_batch,

@@ -18,7 +18,7 @@ Facts: TypeAlias = "dict[str, Any]"
 
 @dataclass(frozen=True)
 class Command:
-    """One word after ``omsm``.
+    """One word after ``omsm``; its place in the list and its line of help are in ``words``.
 
     declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
     show: prints the facts for people
@@ -26,7 +26,6 @@ class Command:
     """
 
     name: str
-    help: str
     declare: Callable[[argparse.ArgumentParser], None]
     act: Callable[[argparse.Namespace], Facts]
     show: Callable[[Facts], None]

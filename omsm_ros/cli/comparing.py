@@ -132,7 +132,6 @@ def _length(value: float) -> str:
 COMMANDS = (
     Command(
         "difference",
-        "do two measurements of one part agree? E_n, maps, verdict",
         _declare_difference,
         _difference,
         _show_difference,

@@ -22,8 +22,9 @@ def _completion(args: argparse.Namespace) -> Facts:
             "completion needs shtab: pip install 'omsm_ros[completion]'"
         ) from err
     from omsm_ros.cli.main import parser_of  # which knows of this module
+    from omsm_ros.cli.words import WORDS
 
-    parser = parser_of("")
+    parser = parser_of(WORDS)
     _prepare(parser, shtab.FILE)
     return {"script": shtab.complete(parser, args.shell)}
 
@@ -53,7 +54,6 @@ def _show_completion(facts: Facts) -> None:
 COMMANDS = [
     Command(
         "completion",
-        "a script for the shell that completes commands, options and names of files",
         _declare_completion,
         _completion,
         _show_completion,

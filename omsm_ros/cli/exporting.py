@@ -67,7 +67,6 @@ def _show_export(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "export",
-        "write a cloud or map in the format of another program",
         _declare_export,
         _export,
         _show_export,

@@ -159,21 +159,18 @@ def _show_surface(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "form",
-        "the part's pose and its form: deviation, Zernike terms, texture",
         _declare_form,
         _form,
         _show_form,
     ),
     Command(
         "compensate",
-        "offsets of the next cut, from the form that was measured",
         _declare_compensate,
         _compensate,
         _show_compensate,
     ),
     Command(
         "surface",
-        "what a nominal surface asks of probe and axes",
         _declare_surface,
         _surface,
         _show_surface,

@@ -258,7 +258,6 @@ def _show_validate(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "identify",
-        "the transfer function from encoder to probe, from a step test",
         _declare,
         _identify,
         _show,
@@ -266,7 +265,6 @@ COMMANDS = (
     ),
     Command(
         "validate",
-        "run a model over another record: how much of it does it account for?",
         _declare_validate,
         _validate,
         _show_validate,

@@ -47,7 +47,6 @@ def _show_import(facts: Facts) -> None:
 COMMANDS = [
     Command(
         "import",
-        "make a bag of CSV, NumPy, MATLAB, HDF5 or TDMS files, or of foreign ROS topics",
         _declare_import,
         _import,
         _show_import,

@@ -54,4 +54,4 @@ def _show(facts: Facts) -> None:
     table([("fault", text) for text in facts["faults"]] or [("faults", "none found")])
 
 
-COMMANDS = (Command("inspect", "show what a bag holds, or repair it", _declare, _act, _show),)
+COMMANDS = (Command("inspect", _declare, _act, _show),)

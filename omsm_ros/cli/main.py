@@ -9,54 +9,25 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omsm_ros import __version__, quantities
 from omsm_ros.cli.arguments import OneLineParser, number
-from omsm_ros.cli.command import Command
+from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import DEBUG, OmsmError, defect
 from omsm_ros.storage import strict_json
+
+if TYPE_CHECKING:  # it would load what reads bags, for a list of words
+    from omsm_ros.cli.command import Command
 
 DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
 
 _LONGEST_LINE = 1500
 _WIDTH, _INDENT = 79, 14
 
-# A correction takes a quarter of a second; loading what identifies would take twice that.
-WORDS = {
-    "omsm_ros.cli.inspecting": ("inspect",),
-    "omsm_ros.cli.measuring": ("predict", "correct"),
-    "omsm_ros.cli.resolving": ("selfcal", "reversal", "latency"),
-    "omsm_ros.cli.aligning": ("align",),
-    "omsm_ros.cli.forming": ("form", "compensate", "surface"),
-    "omsm_ros.cli.identifying": ("identify", "validate"),
-    "omsm_ros.cli.calibrating": ("plan", "verify", "compare", "calset"),
-    "omsm_ros.cli.starting": ("twin", "doctor"),
-    "omsm_ros.cli.importing": ("import",),
-    "omsm_ros.cli.reporting": ("report",),
-    "omsm_ros.cli.completing": ("completion",),
-    "omsm_ros.cli.campaigning": ("batch",),
-    "omsm_ros.cli.remembering": ("history",),
-    "omsm_ros.cli.exporting": ("export",),
-    "omsm_ros.cli.comparing": ("difference",),
-    "omsm_ros.cli.rippling": ("spectrum",),
-}
-
 DEMO = "demo"
-_DEMO_HELP = "calibrate and measure on the digital twin (needs ROS)"
-
-# As one comes to need them, for the list of all commands.
-TASKS = {
-    "begin": ("doctor", DEMO, "twin", "completion"),
-    "recordings": ("inspect", "import"),
-    "dynamics of probe and machine": ("plan", "identify", "verify", "compare", "calset"),
-    "latency": ("selfcal", "reversal", "latency"),
-    "a scan": ("surface", "predict", "align", "correct", "report"),
-    "the part": ("form", "compensate", "difference", "spectrum", "export"),
-    "many scans": ("batch", "history"),
-    "models of other systems": ("validate",),
-}
 
 # What stands after "--" is for the command that these run in turn.
 PASS_ON = ("batch",)
@@ -78,58 +49,66 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
 'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
 
 
-def _commands(word: str) -> list[Command]:
-    """The commands of the module that knows ``word``; all of them if none does."""
-    wanted = [module for module, words in WORDS.items() if word in words] or list(WORDS)
-    return [c for module in wanted for c in importlib.import_module(module).COMMANDS]
+def _command(word: str) -> Command:
+    """The command ``word``; nothing is loaded but what its module needs."""
+    module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
+    return next(command for command in module.COMMANDS if command.name == word)
 
 
-def _by_task(helps: Mapping[str, str]) -> str:
+def _by_task() -> str:
     """The commands with what each does, those of one task together."""
-    lines, placed = [], {word for words in TASKS.values() for word in words}
-    others = tuple(word for word in helps if word not in placed)
-    for task, words in {**TASKS, "others": others}.items():
-        lines += ["", f"{task}:"] if words else []
-        for word in words:
-            told = helps.get(word, "")
+    lines = []
+    for task, words in TASKS.items():
+        lines += ["", f"{task}:"]
+        for name, word in words.items():
             lines += textwrap.wrap(
-                f"  {word:<{_INDENT - 2}}{told}", _WIDTH, subsequent_indent=" " * _INDENT
+                f"  {name:<{_INDENT - 2}}{word.help}", _WIDTH, subsequent_indent=" " * _INDENT
             )
     return "\n".join([*lines, "", "'omsm COMMAND --help' has the options of each."])
 
 
-def parser_of(word: str) -> argparse.ArgumentParser:
-    """Return the parser of ``omsm``: with the command ``word``, or with all of them."""
+def parser_of(wanted: Collection[str]) -> argparse.ArgumentParser:
+    """Return the parser of ``omsm``: it knows every word, and the arguments of those ``wanted``."""
     parser = OneLineParser(
         prog="omsm",
         description="Identify, correct and judge recorded measurements.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_by_task(),
     )
-    parser.word = word if any(word in words for words in WORDS.values()) else ""
+    if len(wanted) == 1:
+        (parser.word,) = wanted
     parser.add_argument("--version", action="version", version=__version__)
     words = parser.add_subparsers(required=True, metavar="command", dest="command")
-    commands = _commands(word)
-    parser.epilog = _by_task({DEMO: _DEMO_HELP, **{c.name: c.help for c in commands}})
-    for command in commands:
-        sub = words.add_parser(command.name, description=command.help)
+    for name, word in WORDS.items():
+        sub = words.add_parser(name, description=word.help)
         sub.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
-        sub.set_defaults(run=command)
-        command.declare(sub)
-    demo = words.add_parser(DEMO, description=_DEMO_HELP)
-    demo.add_argument("--json", action="store_true", help="print one JSON object, in SI units")
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
+        if name in wanted:
+            _declare(name, sub)
+    return parser
+
+
+def _declare(word: str, sub: argparse.ArgumentParser) -> None:
+    if word == DEMO:
+        _declare_demo(sub)
+        return
+    command = _command(word)
+    sub.set_defaults(run=command)
+    command.declare(sub)
+
+
+def _declare_demo(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
-    demo.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
-    demo.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
-    demo.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
-    demo.add_argument("--view", action="store_true", help="show the scan in a browser")
-    demo.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
-    demo.add_argument(
+    sub.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
+    sub.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
+    sub.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
+    sub.add_argument("--view", action="store_true", help="show the scan in a browser")
+    sub.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
+    sub.add_argument(
         "--experiment",
         choices=("chirp", "circles", "vibration", "mirror"),
         help="one of the paper's, Fig. 9, 10, 11 or 8, beside ours; needs no ROS",
     )
-    return parser
 
 
 def _experiment(args: argparse.Namespace) -> int:
@@ -168,7 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         own, passed_on = _split(given)
-        args = parser_of(own[0]).parse_args(own)
+        named = [a for a in own if a in WORDS][:1]
+        args = parser_of(named).parse_args(own)
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:

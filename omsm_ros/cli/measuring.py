@@ -250,14 +250,12 @@ def _times(factor: float) -> str:
 COMMANDS = (
     Command(
         "predict",
-        "what a motion will cost, and how fast it may run",
         _declare_predict,
         _predict,
         _show_predict,
     ),
     Command(
         "correct",
-        "correct a recorded scan: cloud, summary and report",
         _declare_correct,
         _correct,
         _show_correct,

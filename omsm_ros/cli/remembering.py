@@ -98,7 +98,6 @@ def _drift(found: dict[str, float] | None, unit: str) -> str:
 COMMANDS = [
     Command(
         "history",
-        "what was calibrated and measured, and how each machine drifts",
         _declare_history,
         _history,
         _show_history,

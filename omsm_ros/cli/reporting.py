@@ -32,7 +32,6 @@ def _show_report(facts: Facts) -> None:
 COMMANDS = [
     Command(
         "report",
-        "the page of a finished correction once more, as after --no-report",
         _declare_report,
         _report,
         _show_report,

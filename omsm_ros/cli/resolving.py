@@ -221,7 +221,6 @@ def _show_latency(facts: Facts) -> None:
 COMMANDS = (
     Command(
         "selfcal",
-        "dynamics from two or more scans of one part at different speeds or directions",
         _declare_selfcal,
         _selfcal,
         _show_selfcal,
@@ -229,14 +228,12 @@ COMMANDS = (
     ),
     Command(
         "reversal",
-        "is the lag latency? From two scans with opposite spindle directions",
         _declare_reversal,
         _reversal,
         _show_reversal,
     ),
     Command(
         "latency",
-        "declare how much of a calibration's lag is latency, with a reason",
         _declare_latency,
         _latency,
         _show_latency,

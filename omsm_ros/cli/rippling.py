@@ -83,7 +83,6 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
 COMMANDS = (
     Command(
         "spectrum",
-        "lines in scans of one part, and what each is: on the part, vibration, folded, spindle",
         _declare_spectrum,
         _spectrum,
         _show_spectrum,

@@ -80,14 +80,12 @@ def _show_twin(facts: Facts) -> None:
 COMMANDS = [
     Command(
         "twin",
-        "bags of the digital twin: a step test and a scan to work on",
         _declare_twin,
         _twin,
         _show_twin,
     ),
     Command(
         "doctor",
-        "is this computer ready to run a cell? What to do where it is not",
         _declare_doctor,
         _doctor,
         _show_doctor,

@@ -8,6 +8,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.words import WORDS
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.recording.bag_writer import BagWriter
@@ -88,7 +89,7 @@ def test_every_command_of_a_bag_looks_for_the_cell_that_is_asked_for(
 
 
 def test_no_command_of_a_bag_is_forgotten():
-    actions = parser_of("")._actions
+    actions = parser_of(WORDS)._actions
     (words,) = (a for a in actions if isinstance(a, argparse._SubParsersAction))
     with_cells = {
         name

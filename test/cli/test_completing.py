@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli.main import WORDS
+from omsm_ros.cli.words import WORDS
 
 pytest.importorskip("shtab", reason="shtab is an optional package")
 
@@ -30,7 +30,7 @@ def script(tmp_path_factory):
         ("omsm correct --cal", {"--calibration"}),
         ("omsm correct sca", {"scan.mcap"}),
         ("omsm identify --hold z", {"zero-order"}),
-        ("omsm ", {word for words in WORDS.values() for word in words} | {"demo"}),
+        ("omsm ", set(WORDS)),
     ],
 )
 def test_what_bash_offers(script, tmp_path, line, expected):

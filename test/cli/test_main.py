@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.cli.words import WORDS
 from omsm_ros.storage import bags, calibration_file, cloud_file
 from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
@@ -183,10 +184,28 @@ def test_commands_work_without_ros(folder):
 def test_every_word_is_where_main_looks_for_it():
     import importlib
 
-    from omsm_ros.cli.main import WORDS
+    for module in {word.module for word in WORDS.values()} - {""}:
+        made = importlib.import_module(f"omsm_ros.cli.{module}").COMMANDS
+        assert {c.name for c in made} == {n for n, word in WORDS.items() if word.module == module}
 
-    for module, words in WORDS.items():
-        assert tuple(c.name for c in importlib.import_module(module).COMMANDS) == words
+
+@pytest.mark.parametrize(("word", "modules"), [("--help", set()), ("export", {"exporting"})])
+def test_only_what_is_asked_for_is_loaded(word, modules):
+    block = (
+        "import json, sys\n"
+        "from omsm_ros.cli import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "except SystemExit:\n    print(json.dumps(list(sys.modules)), file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", block, word, *(["--help"] if modules else [])],
+        capture_output=True, text=True, timeout=50, check=True,
+    )  # fmt: skip
+    loaded = set(json.loads(done.stderr))
+    ours = {f"omsm_ros.cli.{word.module}" for word in WORDS.values()}
+    assert loaded & ours == {f"omsm_ros.cli.{module}" for module in modules}
+    if not modules:
+        assert not loaded & {"scipy", "rosbags", "matplotlib"}
 
 
 def test_the_help_of_the_command_is_named_where_its_arguments_are_wrong(capsys):
@@ -195,14 +214,10 @@ def test_the_help_of_the_command_is_named_where_its_arguments_are_wrong(capsys):
 
 
 def test_the_list_of_commands_has_each_once_with_its_task(capsys):
-    from omsm_ros.cli.main import DEMO, TASKS, WORDS
-
-    of_tasks = [word for words in TASKS.values() for word in words]
-    assert sorted(of_tasks) == sorted([DEMO, *(w for words in WORDS.values() for w in words)])
     with pytest.raises(SystemExit):
         cli.main(["--help"])
     said = capsys.readouterr().out
-    for word in of_tasks:
+    for word in WORDS:
         (line,) = (one for one in said.splitlines() if one.startswith(f"  {word} "))
         assert len(line.split()) > 2, "what it does"
 

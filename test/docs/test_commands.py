@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
-from omsm_ros.cli.main import DEMO, WORDS, parser_of
+from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.words import WORDS
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -41,18 +42,17 @@ def options(word):
 
 
 def _parser(word):
-    (commands,) = [a for a in parser_of(word)._actions if hasattr(a.choices, "get")]
+    (commands,) = [a for a in parser_of([word])._actions if hasattr(a.choices, "get")]
     return commands.choices[word]
 
 
 def misunderstood(text):
-    words = {word for known in WORDS.values() for word in known} | {DEMO}
     for line in commands(text, "omsm"):
         own, _, passed_on = line.partition(" -- ")
         word, *rest = own.split()[1:]
         if word.startswith("-") or word in ("COMMAND", "…"):
             continue
-        if word not in words:
+        if word not in WORDS:
             yield f"{line!r}: no command {word!r}"
             continue
         given = {re.split(r"[=\\|,]", r)[0] for r in rest if r.startswith("--")}
