@@ -40,7 +40,7 @@ class DiscreteStarts:
 
     def poles(self, order: int) -> list[ComplexArray]:
         """Return proposals of ``order`` poles each, conjugates included."""
-        found = [self._arx(order), *self._iterated(order)]
+        found = [self.arx(order), *self._iterated(order)]
         subspace = self._subspace(order)
         return found if subspace is None else [*found, subspace]
 
@@ -62,7 +62,8 @@ class DiscreteStarts:
         drive = sliding_window_view(u, order + 1)[rows][:, ::-1]
         return np.column_stack([-past[:, 1:], drive, np.ones(len(drive))]), past[:, 0]
 
-    def _arx(self, order: int) -> ComplexArray:
+    def arx(self, order: int) -> ComplexArray:
+        """Return the poles in z (``order``,) of the equation-error fit, ARX."""
         columns, target = self._regressors(self.input, self._filled, order)
         return _poles(least_squares(columns, target)[:order])
 

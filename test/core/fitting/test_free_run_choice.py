@@ -1,6 +1,5 @@
 """The order behind a hold, on simulated systems and measured records."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +8,7 @@ import pytest
 from scipy import io, signal
 
 from omsm_ros.core.fitting import free_run_choice
-from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
 from omsm_ros.core.fitting.free_run_choice import MAX_ORDER, SampledCandidate, choose_sampled
-from omsm_ros.core.fitting.held_problem import DiscreteScaled
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import fit
 from omsm_ros.errors import IdentificationError
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "daisy"
@@ -138,34 +133,6 @@ def test_a_gap_is_bridged():
     used = (np.arange(600) < 200) | (np.arange(600) >= 300)
     found = choose_sampled(u, np.where(used, y, np.nan), used, 0.1)
     assert np.std((output_of(found, y, used) - y)[~used]) < 0.03
-
-
-def test_it_takes_at_most_three_times_a_plain_fit_with_a_hold_out():
-    """The plain one: every order once, from ARX, then the best over the last part again."""
-    u, y = held_system(noise=0.05, samples=1200)
-    used = first_half(1200)
-
-    def timed(task):
-        best = np.inf
-        for _ in range(2):
-            begun = time.process_time()
-            task()
-            best = min(best, time.process_time() - begun)
-        return best
-
-    def plain():
-        problem = choose_sampled_problem(u, y, used)
-        starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
-        for order in range(1, MAX_ORDER + 1):
-            structure = Structure(order, order, False)
-            scaled = DiscreteScaled(structure, problem.rate)
-            fit(problem, structure, [scaled.of_discrete(starts._arx(order))])
-
-    assert timed(lambda: choose_sampled(u, y, used, 0.1)) < 3 * timed(plain)
-
-
-def choose_sampled_problem(u, y, used):
-    return free_run_choice._delayed(u, np.where(used, y, 0.0), used, 0.1, 0)
 
 
 @pytest.mark.parametrize(
