@@ -34,12 +34,20 @@ class StepPlan:
     """Start of each edge [s], height of each [m], its rise [s], and the whole duration [s].
 
     It is a motion of the cell like any in :mod:`omsm_ros.core.machine.trajectories`.
+    Raises ConfigurationError where an edge starts before the one before it has ended.
     """
 
     starts: tuple[float, ...]
     heights: tuple[float, ...]
     rise: float
     duration: float
+
+    def __post_init__(self) -> None:
+        if np.any(np.diff(self.starts) < self.rise):
+            raise ConfigurationError(
+                f"step plan: an edge starts within the rise of {self.rise!r} s of the one before "
+                "it; leave a rest between edges"
+            )
 
     @property
     def travel(self) -> float:
@@ -48,10 +56,15 @@ class StepPlan:
 
     def z(self, time: FloatArray) -> FloatArray:
         """Return the commanded position [m] at ``time`` [s], of the same shape."""
-        position = np.zeros_like(time)
-        for start, height in zip(self.starts, self.heights, strict=True):
-            position = position + height * s_curve((time - start) / self.rise)
-        return position
+        starts, heights = np.asarray(self.starts), np.asarray(self.heights)
+        levels = np.concatenate([[0.0], np.cumsum(heights)])
+        edge = np.maximum(np.searchsorted(starts, time, side="right") - 1, 0)
+        phase = (time - starts[edge]) / self.rise
+        progress = np.ones_like(phase)
+        # An edge takes a hundredth of its rest: there is next to nothing to evaluate.
+        moving = phase < 1
+        progress[moving] = s_curve(phase[moving])
+        return levels[edge] + heights[edge] * progress
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]; only Z moves."""

@@ -48,8 +48,9 @@ def s_curve(phase: FloatArray) -> FloatArray:
     p = np.clip(phase, 0.0, 1.0)
     mirrored = np.where(p > 0.5, 1.0 - p, p)
     late = mirrored - 0.25
-    first = 16 / 3 * mirrored**3
-    second = 1 / 12 + late + 4 * late**2 - 16 / 3 * late**3
+    # Products, for a power of three takes ten times as long.
+    first = 16 / 3 * (mirrored * mirrored * mirrored)
+    second = 1 / 12 + late * (1 + late * (4 - 16 / 3 * late))
     half = np.where(mirrored < 0.25, first, second)
     return np.where(p > 0.5, 1.0 - half, half)
 
