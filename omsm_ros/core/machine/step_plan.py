@@ -64,7 +64,7 @@ class StepPlan:
         # An edge takes a hundredth of its rest: there is next to nothing to evaluate.
         moving = phase < 1
         progress[moving] = s_curve(phase[moving])
-        return levels[edge] + heights[edge] * progress
+        return np.asarray(levels[edge] + heights[edge] * progress)
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]; only Z moves."""
