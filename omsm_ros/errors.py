@@ -14,7 +14,8 @@ them into one line on stderr and exit status 2::
     │   └── SurfaceError                   a nominal surface description
     ├── ProtocolError        (ValueError)  bytes that no device of this kind sends
     └── DeviceError          (OSError)     a device that is absent, silent or lost
-        └── DeviceTimeoutError (TimeoutError)
+        ├── DeviceTimeoutError (TimeoutError)
+        └── NoSamplesError             connected, but nothing that could be read came
 
 Each text names the offending value and the remedy.
 """
@@ -66,6 +67,13 @@ class DeviceError(OmsmError, OSError):
 
 class DeviceTimeoutError(DeviceError, TimeoutError):
     """A device did not answer in time."""
+
+
+class NoSamplesError(DeviceError):
+    """A device is connected, but sends nothing, or nothing that can be read.
+
+    Connecting anew may help, but shows nothing by itself: only samples do.
+    """
 
 
 DEBUG = "OMSM_DEBUG"

@@ -11,21 +11,24 @@ import numpy as np
 from omsm_ros.devices.blocks import BlockSettings, Channels
 from omsm_ros.devices.command_port import CommandPort
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
-from omsm_ros.devices.stream import StreamDevice
+from omsm_ros.devices.stream import UNREADABLE_S, StreamDevice
 from omsm_ros.devices.transport import Transport
+from omsm_ros.errors import NoSamplesError
 from omsm_ros.protocols.micro_epsilon import BlockDecoder
 
 COUNTER_RANGE = 2**32
+# Begins the blocks of controllers whose heads do not say what the frames hold.
+_UNDESCRIBED = b"DATA"
 
 
 class BlockStreamDevice(StreamDevice):
     """Decodes blocks, and talks to the controller where there is a command port.
 
     A model fills in ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
-    (commands), and says which prompts end an answer, and how long one may take.
+    (commands), and says what ends an answer (a regular expression).
     """
 
-    prompts: tuple[bytes, ...] = ()
+    prompt: bytes = b""
 
     def __init__(
         self,
@@ -46,7 +49,7 @@ class BlockStreamDevice(StreamDevice):
         counting = Counting(COUNTER_RANGE, timed=False, period=period)
         super().__init__(transport, settings, channels, counting, now_ns, monotonic)
         self._decoder = BlockDecoder(kind, self._frame)
-        self._unread = 0
+        self._unread, self._undescribed = 0, False
         self._commands, self._answers_within = commands, patience
         self._identity: dict[str, str] = {}
 
@@ -61,11 +64,11 @@ class BlockStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         self._decoder.reset()
-        self._unread = 0
+        self._unread, self._undescribed = 0, False
         if self._commands is None:
             return
         within = self._answers_within
-        with CommandPort(self._commands, self.prompts, within, self._monotonic) as port:
+        with CommandPort(self._commands, self.prompt, within, self._monotonic) as port:
             self._identity = self._set_up(port)
 
     def _decode(self, data: bytes) -> Samples:
@@ -78,9 +81,15 @@ class BlockStreamDevice(StreamDevice):
             counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
             parts.append(self._samples_of(frames, counter))
         self._unread = 0 if parts else self._unread + len(data)
+        self._undescribed = not parts and (self._undescribed or _UNDESCRIBED in data)
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _listen_in(self, silent: float) -> None:
+        if silent > UNREADABLE_S and self._undescribed:
+            raise NoSamplesError(
+                f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not say "
+                "what they hold; read this controller over RS-422 (device: confocaldt)"
+            )
         self._check_understood(silent, self._unread)
 
     # --- what a model fills in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +69,13 @@ class Channels(NamedTuple):
     distance: bool = True
     axes: tuple[AxisScaling, ...] | None = None
     timed: bool = True
+
+
+def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
+    """Axes whose encoders wrap after ``counts`` where nothing else is said."""
+    if axes is None:
+        return None
+    return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
 
 
 class BlockCutter:

@@ -19,12 +19,12 @@ from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.devices.command_port import CommandPort
 from omsm_ros.devices.counting import SAMPLE, Samples
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
 from omsm_ros.protocols.micro_epsilon import channel_dtype
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S
 
-PROMPTS = (b"OK\r\n", b"$WRONG", b"$UNKNOWN")
+PROMPT = rb"OK *[\r\n]|\$WRONG|\$UNKNOWN"
 # A channel's 24 bits are its measuring range.
 FULL_SCALE = 0xFFFFFF
 
@@ -53,7 +53,7 @@ class CapaNcdtSettings(BlockSettings):
 class CapaNcdtDevice(BlockStreamDevice):
     """Reads one channel, and sets the sample time where there is a command port."""
 
-    prompts = PROMPTS
+    prompt = PROMPT
 
     def __init__(
         self,
@@ -80,14 +80,14 @@ class CapaNcdtDevice(BlockStreamDevice):
         self._wanted = settings
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        identity = {"model": port.ask("$VER", "\r").strip()}
+        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
         self._set_sample_time(port)
         return identity
 
     def _set_sample_time(self, port: CommandPort) -> None:
         """The controller takes the next time it has, and says which."""
         wanted = self._wanted.sample_period / MICROSECOND_S
-        said = port.ask(f"$STI{wanted:.0f}", "\r")
+        said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
         found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
         if found is None:
             raise DeviceError(
@@ -98,7 +98,7 @@ class CapaNcdtDevice(BlockStreamDevice):
                 f"{self._transport.name}: {wanted:.0f} µs were asked for, the controller samples "
                 f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
             )
-        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r")
+        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return channel_dtype(kind[0])
@@ -124,6 +124,6 @@ class CapaNcdtDevice(BlockStreamDevice):
     def _listen_in(self, silent: float) -> None:
         super()._listen_in(silent)
         if not self._wanted.triggered and silent > self._wanted.patience:
-            raise DeviceError(
+            raise NoSamplesError(
                 f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
             )

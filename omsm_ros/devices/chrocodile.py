@@ -11,11 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
+from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockPair, BlockSettings, Channels, wrapping
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+from omsm_ros.errors import (
+    ConfigurationError,
+    DeviceError,
+    DeviceTimeoutError,
+    NoSamplesError,
+)
 from omsm_ros.protocols.chrocodile import QUERY, Answer
 from omsm_ros.protocols.chrocodile_readings import (
     ENCODER_RANGE,
@@ -48,7 +53,8 @@ _DECISIVE = {
     "SCA": "full_scale",
 }  # fmt: skip
 _COUNTER_RANGE = 2**16
-_READ_S = 0.05
+# How far a rate may be from a whole multiple of another [relative].
+_MULTIPLE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +131,7 @@ class Chrocodile(StreamDevice):
         super().__init__(
             transport,
             replace(settings, free_running=free),
-            Channels(axes=_wrapping(settings.axes), timed=timed),
+            Channels(axes=wrapping(settings.axes, ENCODER_RANGE), timed=timed),
             Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period),
             now_ns,
             monotonic,
@@ -137,6 +143,9 @@ class Chrocodile(StreamDevice):
         self._identity: dict[str, str] = {}
         self._asked = 0.0
         self._ever_set_up = False
+        self._exposures = 1  # that the device averages into a sample
+        self._slowed_by_averaging = True
+        self._unheard = False  # it answered, but no telegram could be read
 
     @property
     def identity(self) -> dict[str, str]:
@@ -156,6 +165,19 @@ class Chrocodile(StreamDevice):
         """Return all statistics by name, those of the protocol included."""
         flags = {"triggers_lost": self.triggers_lost, "triggers_delayed": self.triggers_delayed}
         return super().counts() | flags
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """As of every device; one that averages without slowing down is set up anew."""
+        blocks = super().poll(timeout)
+        self._unheard &= not blocks
+        faster = (1 + self._cutter.period_deviation) * self._exposures
+        if self._exposures > 1 and self._cutter.wrong_rate and abs(faster - 1) < _MULTIPLE:
+            self._slowed_by_averaging = False
+            raise DeviceError(
+                f"{self._transport.name} averages {self._exposures} exposures and sends no fewer "
+                "samples; it is set up anew for that"
+            )
+        return blocks
 
     def dark_reference(self) -> None:
         """Take the dark reference: no target may be in range. It lasts about three seconds."""
@@ -178,19 +200,20 @@ class Chrocodile(StreamDevice):
     def _prepare(self) -> None:
         wanted = self._wanted
         self._begin()
-        self._identity = {"model": self._try("VER").text or "CHRocodile"}
+        self._identity = {"model": _version(self._try("VER").text)}
         intact = self._ever_set_up and self._selected()
         if wanted.head is not None:
             self._set("SEN", wanted.head)
         self._set("SODX", *self._selection)
+        if wanted.averaging is not None:
+            self._set("AVD", wanted.averaging)
+        self._read("AVD")
         self._set_rate()
-        for name, value in (
-            ("LAI", wanted.lamp), ("AVD", wanted.averaging), ("THR", wanted.threshold),
-        ):  # fmt: skip
+        for name, value in (("LAI", wanted.lamp), ("THR", wanted.threshold)):
             if value is not None:
                 self._set(name, value)
         self._read_scale()
-        for name in ("SEN", "AVD", "LAI"):
+        for name in ("SEN", "LAI"):
             self._read(name)
         if not intact:
             self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
@@ -223,7 +246,11 @@ class Chrocodile(StreamDevice):
             )
 
     def _set_rate(self) -> None:
-        rate = 1 / self._wanted.sample_period
+        """SHZ counts exposures: as many to a sample, or to a trigger, as are averaged into it."""
+        told = _value(self._identity.get("AVD", "1"))
+        averaged = isinstance(told, float) and told > 1 and self._slowed_by_averaging
+        self._exposures = round(told) if averaged and isinstance(told, float) else 1
+        rate = self._exposures / self._wanted.sample_period
         free = self._wanted.trigger == "free_run"
         self._ask("SHZ", rate if free else float(round(rate * _ABOVE_TRIGGER)))
         found = self._ask("SHZ", QUERY).numbers
@@ -233,7 +260,7 @@ class Chrocodile(StreamDevice):
         if free and abs(found[0] / rate - 1) > RATE_TOLERANCE / 2:
             raise DeviceError(
                 f"{self._transport.name}: {rate:.6g} Hz was asked for, the device measures at "
-                f"{found[0]:.6g} Hz; set sample_period to {1 / found[0]:.9g} s"
+                f"{found[0]:.6g} Hz; set sample_period to {self._exposures / found[0]:.9g} s"
             )
         if not free and found[0] < rate:
             raise DeviceError(
@@ -266,10 +293,14 @@ class Chrocodile(StreamDevice):
             return
         self._asked = now
         if not self._selected():
-            raise DeviceError(f"{self._transport.name} lost its settings (a restart?)")
-        if self._wanted.trigger == "free_run":
             raise DeviceError(
-                f"{self._transport.name} answers, but sent no telegram for {silent:.1f} s"
+                f"{self._transport.name} lost its settings (a restart?); it is set up anew"
+            )
+        if self._wanted.trigger == "free_run":
+            self._unheard = True
+            raise NoSamplesError(
+                f"{self._transport.name} answers, but sent no telegram that could be read for "
+                f"{silent:.1f} s; check its trigger, and that no other program sets it up"
             )
 
     def _selected(self) -> bool:
@@ -295,6 +326,11 @@ class Chrocodile(StreamDevice):
         return samples
 
 
+def _version(text: str) -> str:
+    """The answer to VER; some devices answer it with words of refusal."""
+    return text if any(map(str.isdigit, text)) else "CHRocodile"
+
+
 def _value(text: str) -> object:
     """A number, where the text is one."""
     try:
@@ -308,10 +344,3 @@ def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bo
     if within == 0:
         return set(wanted) <= set(found)  # in the device's own order
     return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)
-
-
-def _wrapping(axes: tuple[AxisScaling, ...] | None) -> tuple[AxisScaling, ...] | None:
-    """The encoders wrap with their 32 bits where nothing else is said."""
-    if axes is None:
-        return None
-    return tuple(replace(axis, wrap=axis.wrap or ENCODER_RANGE) for axis in axes)

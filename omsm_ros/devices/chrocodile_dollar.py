@@ -61,6 +61,9 @@ class ChrocodileDevice(Chrocodile):
         self._stream.start()
         self._early.clear()
         self._ask("STO")
+        if self._unheard:
+            # Somebody may have set another sync sequence; its bytes follow the command at once.
+            self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
 
     def _finish(self) -> None:
         self._ask(FORMATS[self._wanted.format])
@@ -96,7 +99,9 @@ class ChrocodileDevice(Chrocodile):
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         """The answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
-        wire = command(name, *arguments)
+        return self._exchange(command(name, *arguments), patience)
+
+    def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
         self._stream.expect(wire)
         self._transport.write(wire)
         deadline = self._monotonic() + (patience or self._wanted.patience)
@@ -109,7 +114,7 @@ class ChrocodileDevice(Chrocodile):
             if answer is not None:
                 return answer
             if self._monotonic() > deadline:
-                raise self._unanswered(wire.decode().strip(), self._stream.last_outside)
+                raise self._unanswered(wire.decode("latin-1").strip(), self._stream.last_outside)
 
     def _decode(self, data: bytes) -> Samples:
         early, self._early = self._early, []

@@ -11,7 +11,7 @@ import numpy as np
 from omsm_ros.devices.chrocodile import Chrocodile, ChrocodileSettings, RefusedError
 from omsm_ros.devices.counting import SAMPLE, Samples
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import DeviceError
+from omsm_ros.errors import DeviceError, DeviceTimeoutError
 from omsm_ros.protocols.chrocodile import Answer
 from omsm_ros.protocols.chrocodile_packet import (
     CONFIGURED,
@@ -58,8 +58,17 @@ class ChrocodilePacketDevice(Chrocodile):
         self._early.clear()
         self._commands.clear()
         self._said = b""
-        self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
+        self._await_configuration()
         self._try("STO")
+
+    def _await_configuration(self) -> None:
+        """The device tells it to every new client; one that has not is asked for it once."""
+        told = self._wanted.patience / 2
+        try:
+            self._await("CONF", lambda c: c.name == CONFIGURED, told)
+        except DeviceTimeoutError:
+            self._transport.write(encode_command(Command(CONFIGURED, (), 0, 0)))
+            self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
 
     def _finish(self) -> None:
         self._early.clear()  # measured before the device was set up

@@ -16,24 +16,29 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import IntArray, Status
 from omsm_ros.devices.block_stream import COUNTER_RANGE, BlockStreamDevice
-from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels
+from omsm_ros.devices.blocks import RATE_TOLERANCE, BlockSettings, Channels, wrapping
 from omsm_ros.devices.command_port import CommandPort
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
 from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
 from omsm_ros.protocols.confocaldt_serial import VALUE_BITS, SerialDecoder, distance_of
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling
-from omsm_ros.protocols.micro_epsilon import confocal_dtype
+from omsm_ros.protocols.micro_epsilon import (
+    FIRST_ERROR,
+    INTENSITY_FULL,
+    INTENSITY_MASK,
+    confocal_dtype,
+    intensity_leads,
+)
 from omsm_ros.units import NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
-PROMPTS = (b"->",)
-# Intensity 100 % is 1024, in the lowest eleven bits.
-_INTENSITY_MASK, _INTENSITY_FULL = 0x7FF, 1024
-# Distances from here on are error codes, not nanometres.
-_FIRST_ERROR = 0x7FFFFF00
+# A value of the frame that is passed over.
+PASSED_OVER = "-"
+# Of every answer to GETINFO; a controller that does not know it says so.
+_INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
 
 
@@ -42,10 +47,9 @@ class ConfocalDtSettings(BlockSettings):
     """How the controller is read.
 
     probe: ``full_scale`` is the measuring range, of which RS-422 values are parts
-    values: what a frame holds over RS-422, in order, of SERIAL_VALUES
+    values: what a frame holds over RS-422, in order, of SERIAL_VALUES; "-" is passed over
     axes: scaling of X, Y, Z, B, C, or None;  wired: axes on encoders 1, 2, 3 (0 = X … 4 = C);
     an axis without an encoder stands at its offset
-    intensity_first: order of intensity and distance in an Ethernet frame
     trigger: "free_run", or anything else for a trigger from outside
     patience: for an answer, and for samples of a controller that runs freely [s]
     """
@@ -54,14 +58,18 @@ class ConfocalDtSettings(BlockSettings):
     values: tuple[str, ...] = ("distance",)
     axes: tuple[AxisScaling, ...] | None = None
     wired: tuple[int, ...] = ()
-    intensity_first: bool = False
     trigger: str = "free_run"
     patience: float = 2.0
 
     def __post_init__(self) -> None:
         BlockSettings.__post_init__(self)
-        if "distance" not in self.values or set(self.values) - set(SERIAL_VALUES):
-            raise ConfigurationError(f"values {self.values!r}, expected some of {SERIAL_VALUES!r}")
+        named = [value for value in self.values if value != PASSED_OVER]
+        unknown, doubled = set(named) - set(SERIAL_VALUES), len(set(named)) < len(named)
+        if "distance" not in named or unknown or doubled:
+            raise ConfigurationError(
+                f"values {self.values!r}, expected 'distance' and more of {SERIAL_VALUES!r}, each "
+                f"once, in the order of the frame; {PASSED_OVER!r} for another value"
+            )
         if len(set(self.wired)) < len(self.wired) or set(self.wired) - set(range(len(AXES))):
             raise ConfigurationError(f"wired {self.wired!r}, expected axes 0 to 4, each once")
 
@@ -106,13 +114,13 @@ class ConfocalDtDevice(StreamDevice):
 
     def _decode(self, data: bytes) -> Samples:
         values, spoilt = self._decoder.feed(data)
-        columns = dict(zip(self._wanted.values, values.T, strict=True))
+        columns = dict(zip(self._wanted.values, values.T, strict=True))  # "-": the last of them
         samples = np.zeros(len(values), SAMPLE)
         raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
         samples["distance"] = self._wanted.probe.distance(raw)
         samples["intensity"] = np.nan
         if "intensity" in columns:
-            light = (columns["intensity"] & _INTENSITY_MASK) / _INTENSITY_FULL
+            light = (columns["intensity"] & INTENSITY_MASK) / INTENSITY_FULL
             samples["intensity"] = np.minimum(light, 1.0)
         if "counter" in columns:
             samples["counter"] = columns["counter"]
@@ -130,7 +138,7 @@ class ConfocalDtDevice(StreamDevice):
 class ConfocalDtEthernetDevice(BlockStreamDevice):
     """Reads blocks, and sets the measuring rate where there is a command port."""
 
-    prompts = PROMPTS
+    prompt = b"->"
 
     def __init__(
         self,
@@ -145,7 +153,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         super().__init__(
             transport,
             replace(settings, free_running=settings.period > 0),
-            Channels(axes=_wrapping(settings.axes), timed=False),
+            Channels(axes=wrapping(settings.axes, COUNTER_RANGE), timed=False),
             kind="confocal",
             period=settings.period,
             patience=settings.patience,
@@ -154,6 +162,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             monotonic=monotonic,
         )
         self._wanted = settings
+        self._intensity_leads = False  # as the manual draws it, until the words tell
 
     @property
     def settings(self) -> dict[str, object]:
@@ -162,10 +171,10 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         return {name: told[name] for name in ("name", "article", "serial", "rate") if name in told}
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
-        return confocal_dtype(kind, self._wanted.intensity_first)
+        return confocal_dtype(kind)
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        identity = _info(port.ask("GETINFO", "\n"))
+        identity = _info(port.ask("GETINFO", "\n", _INFORMATION))
         self._set_rate(port)
         return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
 
@@ -176,11 +185,17 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             raise DeviceError(
                 f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
             )
-        found = re.search(r"MEASRATE\s+([\d.]+)", port.ask("MEASRATE", "\n").rpartition("\n")[0])
-        if found and abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
+        said = port.ask("MEASRATE", "\n")
+        told = [float(number) for number in re.findall(r"\d+\.?\d*", said) if float(number) > 0]
+        if not told:
+            raise DeviceError(
+                f"{self._transport.name} did not tell its measuring rate ({said[-64:]!r}); check "
+                "that command_port is this controller's, or set it to 0"
+            )
+        if abs(told[-1] / wanted - 1) > RATE_TOLERANCE:
             raise DeviceError(
                 f"{self._transport.name}: {wanted:.4g} kHz was asked for, the controller measures "
-                f"at {found[1]} kHz; set sample_period to {1e-3 / float(found[1]):.9g} s"
+                f"at {told[-1]:g} kHz; set sample_period to {1e-3 / told[-1]:.9g} s"
             )
 
     def _samples_of(
@@ -189,8 +204,8 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         names = frames.dtype.names or ()
         samples = np.zeros(len(frames), SAMPLE)
         samples["counter"] = frames["counter"] if "counter" in names else counter
-        raw = frames["distance 1"].astype(np.int64)
-        nothing = raw >= _FIRST_ERROR
+        raw, light = self._peak(frames)
+        nothing = raw >= FIRST_ERROR
         metres = np.where(nothing, np.nan, raw * NANOMETRE_M)
         samples["distance"] = self._wanted.probe.distance(metres)
         beyond = np.abs(metres) > self._wanted.probe.full_scale
@@ -198,12 +213,25 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             [nothing, beyond], [Status.NO_TARGET, Status.OUT_OF_RANGE], Status.OK
         )
         samples["intensity"] = np.nan
-        if "intensity 1" in names:
-            light = (frames["intensity 1"] & _INTENSITY_MASK) / _INTENSITY_FULL
-            samples["intensity"] = np.minimum(light, 1.0)
+        if light is not None:
+            samples["intensity"] = np.minimum((light & INTENSITY_MASK) / INTENSITY_FULL, 1.0)
         for number, axis in enumerate(self._wanted.wired, start=1):
             samples["counts"][:, axis] = self._encoder(frames, number)
         return samples
+
+    def _peak(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]]
+    ) -> tuple[IntArray, IntArray | None]:
+        """Distance and intensity of the first peak, in whichever order this controller sends."""
+        distance: IntArray = frames["distance 1"].astype(np.int64)
+        if "intensity 1" not in (frames.dtype.names or ()):
+            return distance, None
+        words = np.stack([distance, frames["intensity 1"].astype(np.int32)], axis=1)
+        told = intensity_leads(words, self._wanted.probe.full_scale / NANOMETRE_M)
+        if told is not None:
+            self._intensity_leads = told
+        first, second = words.T
+        return (second, first) if self._intensity_leads else (first, second)
 
     def _encoder(self, frames: np.ndarray[tuple[int], np.dtype[np.void]], number: int) -> IntArray:
         if f"encoder {number}" not in (frames.dtype.names or ()):
@@ -221,7 +249,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
 
 def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
     if settings.period and silent > settings.patience:
-        raise DeviceError(
+        raise NoSamplesError(
             f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "
             "interface and (RS-422) baud rate"
         )
@@ -231,10 +259,3 @@ def _info(said: str) -> dict[str, str]:
     """``Name: value`` lines of an answer."""
     pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", said)
     return {key.strip().lower(): value.strip() for key, value in pairs}
-
-
-def _wrapping(axes: tuple[AxisScaling, ...] | None) -> tuple[AxisScaling, ...] | None:
-    """The encoders wrap with their 32 bits where nothing else is said."""
-    if axes is None:
-        return None
-    return tuple(replace(axis, wrap=axis.wrap or COUNTER_RANGE) for axis in axes)

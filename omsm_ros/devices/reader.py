@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Protocol
 
 from omsm_ros.devices.blocks import BlockPair
-from omsm_ros.errors import ConfigurationError, DeviceError, defect
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError, defect
 
 _READ_S = 0.05
 # The pause before connecting again doubles from the first to the second [s].
@@ -46,7 +46,8 @@ class State(Enum):
 class DeviceReader:
     """Connects, reads, hands blocks over, and connects again after growing pauses.
 
-    trouble: what keeps it from reading, one line; empty while all is well
+    trouble: what keeps it from reading, one line; empty while all is well. That a device sends
+    nothing readable stays until samples come: connecting anew does not disprove it.
     connections: how often the device was connected and set up
     """
 
@@ -69,6 +70,7 @@ class DeviceReader:
         self._note = note
         self._back_off = back_off
         self._when_connected = connected
+        self._unproven = False
         self._requests: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
             queue.SimpleQueue()
         )
@@ -124,6 +126,7 @@ class DeviceReader:
                 any_came |= bool(blocks)
                 self._hand_over(blocks)
         except (DeviceError, ConfigurationError) as err:
+            self._unproven = isinstance(err, NoSamplesError)
             self._tell(str(err))
             self.state = State.LOST
         except Exception as err:  # a defect of ours must not end the reading for good
@@ -142,14 +145,17 @@ class DeviceReader:
     def _connected(self) -> None:
         self.connections += 1
         self.state = State.READING
-        self._tell("")
+        if not self._unproven:
+            self._tell("")
         self._when_connected()
 
     def _hand_over(self, blocks: Sequence[BlockPair]) -> None:
         if blocks:
             self._deliver(blocks)
         if self.state is State.READING:
-            self._tell(self._device.trouble)
+            self._unproven &= not blocks
+            if self._device.trouble or not self._unproven:
+                self._tell(self._device.trouble)
 
     def _tell(self, trouble: str) -> None:
         if trouble != self.trouble:

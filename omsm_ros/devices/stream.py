@@ -15,7 +15,7 @@ import numpy as np
 from omsm_ros.devices.blocks import BlockCutter, BlockPair, BlockSettings, Channels
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples, SequenceTracker
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import DeviceError
+from omsm_ros.errors import NoSamplesError
 
 # Bytes without a sample for so long are another device's, or come at another baud rate.
 UNREADABLE_S = 2.0
@@ -186,12 +186,12 @@ class StreamDevice:
     # --- common
 
     def _check_understood(self, silent: float, unread: int) -> None:
-        """Raise DeviceError if bytes keep coming, but for ``silent`` [s] no sample in them.
+        """Raise NoSamplesError if bytes keep coming, but for ``silent`` [s] no sample in them.
 
         unread: bytes that came since the last sample, an idle line's left out
         """
         if silent > UNREADABLE_S and unread:
-            raise DeviceError(
+            raise NoSamplesError(
                 f"{self._transport.name} sends bytes ({unread} in {silent:.1f} s), but no samples "
                 "of this device; check the baud rate and what is connected"
             )

@@ -85,7 +85,7 @@ class ChrocodileEmulator(Instrument):
         """Return samples per second as set."""
         if self._triggered:
             return super().rate()
-        return float(self._values["SHZ"])
+        return float(self._values["SHZ"]) / max(1.0, float(self._values["AVD"]))
 
     def streaming(self) -> bool:
         """Return whether samples are to be sent."""
@@ -102,6 +102,10 @@ class ChrocodileEmulator(Instrument):
         name, arguments = request.name, request.arguments
         if name in ("STA", "STO"):
             self._started_stream = name == "STA"
+            return ""
+        if name == "SSQ":
+            self._sync = request.wire[4:6]
+            self._layout = Layout.of(self._layout.signals, self._sync)
             return ""
         if name in ("BIN", "ASC"):
             self._binary = name == "BIN"

@@ -23,7 +23,8 @@ PREAMBLES = (b"MEAS", b"SAEM")
 MAX_BLOCK_BYTES = 1 << 20
 
 HEADERS = {
-    # preamble, order, serial, flags 1, flags 2, frames, bytes a frame, counter
+    # preamble, order, serial, flags 1, flags 2, frames, bytes a frame (or the other way round:
+    # manuals and open clients differ), counter
     "confocal": struct.Struct("<4sIIIIHHI"),
     # preamble, order, serial, channels, status, frames, bytes a frame, counter
     "capacitive": struct.Struct("<4sIIQIHHI"),
@@ -50,6 +51,11 @@ FLAGS_2: tuple[tuple[int, str, int], ...] = (
     (16, "maximum", 4),
     (17, "peak to peak", 4),
 )
+# Intensity 100 % is 1024, in the lowest eleven bits; above them is the height of the peak.
+INTENSITY_MASK, INTENSITY_FULL = 0x7FF, 1024
+_NO_INTENSITY = 0xC000F800
+# Distances from here on are error codes, not nanometres.
+FIRST_ERROR = 0x7FFFFF00
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
 
 
@@ -63,11 +69,10 @@ class Block(NamedTuple):
     frames: NDArray[np.uint8]
 
 
-def confocal_dtype(flags: tuple[int, int], intensity_first: bool = False) -> np.dtype[np.void]:
+def confocal_dtype(flags: tuple[int, int]) -> np.dtype[np.void]:
     """What the flags of a confocalDT say a frame holds; ProtocolError if it has no distance.
 
-    intensity_first: order of the two values of a peak; the public description shows distance
-    first, the flags are numbered the other way
+    Of a peak with intensity, the two words may stand in either order: see ``intensity_leads``.
     """
     fields = [(name, size) for bit, name, size in FLAGS_1 if flags[0] >> bit & 1]
     peaks = sum(flags[0] >> bit & 1 for bit in PEAK_BITS)
@@ -76,10 +81,9 @@ def confocal_dtype(flags: tuple[int, int], intensity_first: bool = False) -> np.
     if not peaks:
         raise ProtocolError(f"flags {flags[0]:#x} {flags[1]:#x} hold no distance")
     for peak in range(1, peaks + 1):
-        pair = [(f"distance {peak}", 4)]
+        fields.append((f"distance {peak}", 4))
         if flags[0] >> INTENSITY_BIT & 1:
-            pair.insert(0 if intensity_first else 1, (f"intensity {peak}", 4))
-        fields += pair
+            fields.append((f"intensity {peak}", 4))
     for word, table in ((flags[0], AFTER_PEAKS), (flags[1], FLAGS_2)):
         fields += [(name, size) for bit, name, size in table if word >> bit & 1]
     return np.dtype([(name, _format(name, size)) for name, size in fields])
@@ -89,6 +93,20 @@ def _format(name: str, size: int) -> str:
     if size == _VIDEO_BYTES:
         return f"V{size}"
     return "<i4" if name.startswith(_SIGNED) else "<u4"
+
+
+def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
+    """Whether the first of a peak's two ``words`` (n, 2) is the intensity; None if nothing tells.
+
+    One manual draws the distance first, others name the intensity first. The words tell: in an
+    intensity bits 11 to 15, 30 and 31 are zero; a distance is at most ``furthest`` [nm], or an
+    error code.
+    """
+    distance = (np.abs(words) <= furthest) | (words >= FIRST_ERROR)
+    light = (words & _NO_INTENSITY == 0) & (words & INTENSITY_MASK <= INTENSITY_FULL)
+    leads, follows = light[:, 0] & distance[:, 1], distance[:, 0] & light[:, 1]
+    votes = int(np.sum(leads & ~follows)) - int(np.sum(follows & ~leads))
+    return votes > 0 if votes else None
 
 
 def channel_dtype(field: int) -> np.dtype[np.void]:
@@ -179,16 +197,23 @@ class BlockDecoder:
         """Bytes of the block at ``place``; 0 = it is none; None = not all here yet."""
         if place + self._header.size > len(self._buffer):
             return None
-        fields = self._header.unpack_from(self._buffer, place)
-        count, width = fields[-3], fields[-2]
-        size = self._header.size + count * width
-        try:
-            sound = count > 0 and width == self._dtype_of(fields[3:5]).itemsize
-        except ProtocolError:
-            sound = False
-        if not sound or size > MAX_BLOCK_BYTES or self._cut_off(place, size):
+        shape = self._shape(self._header.unpack_from(self._buffer, place))
+        if shape is None:
+            return 0
+        size = self._header.size + shape[0] * shape[1]
+        if size > MAX_BLOCK_BYTES or self._cut_off(place, size):
             return 0
         return size if place + size <= len(self._buffer) else None
+
+    def _shape(self, fields: tuple[int, ...]) -> tuple[int, int] | None:
+        """Frames, and bytes of each, whichever of the two stands first; None if neither fits."""
+        try:
+            width = self._dtype_of((fields[3], fields[4])).itemsize
+        except ProtocolError:
+            return None
+        first, second = fields[-3], fields[-2]
+        count = first if second == width else second if first == width else 0
+        return (count, width) if count else None
 
     def _cut_off(self, place: int, size: int) -> bool:
         """Whether another block begins inside the one at ``place``, or none at its end."""
@@ -202,10 +227,10 @@ class BlockDecoder:
 
     def _block(self, place: int, size: int) -> Block:
         fields = self._header.unpack_from(self._buffer, place)
-        count, width, counter = fields[-3:]
+        shape = self._shape(fields)
+        assert shape is not None  # it was asked before
+        count, width = shape
         raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
         self._packets += 1
         self._understood += size
-        return Block(
-            fields[1], fields[2], (fields[3], fields[4]), counter, raw.reshape(count, width)
-        )
+        return Block(fields[1], fields[2], (fields[3], fields[4]), fields[-1], raw.reshape(shape))

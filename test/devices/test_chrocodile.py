@@ -324,7 +324,8 @@ def test_it_tells_what_a_calibration_belongs_to(cell: Any, wanted: dict[str, flo
     assert run.device.settings == {}
     run.device.open()
     assert run.device.settings == {
-        "model": "CHRocodile 2 emulated", "head": 0, "rate": 1000, "full_scale": 100,
+        "model": "CHRocodile 2 emulated", "head": 0, "full_scale": 100,
+        "rate": 1000 * wanted.get("averaging", 1),  # of exposures
         "averaging": wanted.get("averaging", 1), "lamp": wanted.get("lamp", 100),
         "latch": "start", "trigger": "free_run",
     }  # fmt: skip

@@ -106,8 +106,28 @@ def test_another_service_on_the_port_is_named(cell: Any) -> None:
     run = cell()
     run.instrument.greet = lambda: run.instrument.say(b"SSH-2.0-OpenSSH_9.6\r\n")
     run.instrument.streaming = lambda: False
+    run.instrument.receive = lambda data: None
     with pytest.raises(DeviceTimeoutError, match=r"did not answer 'CONF'; it sends .*SSH-2.0"):
         run.device.open()
+
+
+def test_a_device_that_tells_nothing_by_itself_is_asked_for_its_configuration(cell: Any) -> None:
+    run = cell()
+    told, usual = run.instrument.greet, run.instrument.receive
+    run.instrument.greet = lambda: None
+
+    def receive(data: bytes) -> None:
+        if b"CONF" in data:
+            told()
+        else:
+            usual(data)
+
+    run.instrument.receive = receive
+    run.run(3.0)
+    run.end()
+    run.check()
+    assert run.delivered > 1500
+    assert run.troubles == []
 
 
 def test_a_device_at_another_rate_is_withheld(cell: Any) -> None:

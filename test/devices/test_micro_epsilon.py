@@ -17,13 +17,14 @@ from omsm_ros.devices.confocaldt import (
 )
 from omsm_ros.emulators.chrocodile import AXIS_SCALING
 from omsm_ros.emulators.instrument import Instrument
-from omsm_ros.emulators.loopback import Loopback
 from omsm_ros.emulators.micro_epsilon import (
     CapaNcdtEmulator,
     ConfocalDtEmulator,
     ConfocalDtSerialEmulator,
 )
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+
+from .with_commands import WithCommands
 
 THREE = ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2))
 FAULTS: dict[str, Callable[[Instrument], None]] = {
@@ -91,18 +92,6 @@ def test_an_encoder_that_is_not_sent_is_named(bench: Any) -> None:
     run = ethernet(bench, replace(THREE, wired=(0, 1, 2, 4)))
     run.run(0.5)
     assert "sends no encoder 4" in run.troubles[0]
-
-
-class WithCommands:
-    """A controller with both its ports, on one clock."""
-
-    def __init__(self, emulator: Any, device: Any, wanted: Any, **options: Any) -> None:
-        self.data = Loopback()
-        self.port = Loopback(self.data.clock)
-        clock = self.data.clock
-        self.emulator = emulator(self.data.line, clock=clock, commands=self.port.line, **options)
-        self.data.instrument = self.port.instrument = self.emulator
-        self.device = device(self.data, wanted, clock.nanoseconds, clock, commands=self.port)
 
 
 def test_the_rate_is_set_and_read_back() -> None:
@@ -245,6 +234,8 @@ def test_a_channel_it_does_not_have_is_named(bench: Any) -> None:
     [
         lambda: CapaNcdtSettings(channel=0),
         lambda: ConfocalDtSettings(values=("counter",)),
+        lambda: ConfocalDtSettings(values=("distance", "exposure")),
+        lambda: ConfocalDtSettings(values=("distance", "distance")),
         lambda: ConfocalDtSettings(wired=(0, 0)),
     ],
 )
@@ -270,6 +261,10 @@ def test_another_service_on_the_port_is_told_though_a_trigger_may_be_waited_for(
     run = bench(Banner, device, wanted)
     run.run(4.0)
     assert "no samples of this device" in run.troubles[0]
+    blocks = bench(Banner, device, wanted)
+    blocks.instrument.pack = lambda measured, *_: [b"DATA" + bytes(184)] * len(measured)
+    blocks.run(4.0)
+    assert "read this controller over RS-422" in blocks.troubles[0]
     quiet = bench(Banner, device, wanted, triggered=True)
     quiet.run(4.0)
     assert quiet.troubles == []

@@ -8,7 +8,7 @@ import pytest
 
 from omsm_ros.devices.blocks import BlockPair
 from omsm_ros.devices.reader import DeviceReader, State
-from omsm_ros.errors import DeviceError
+from omsm_ros.errors import DeviceError, NoSamplesError
 
 BLOCK = BlockPair(None, None)
 
@@ -73,6 +73,15 @@ def test_it_connects_again_and_tells_each_trouble_once() -> None:
         "lost; trying again",
         "connected and set up",
     ]
+
+
+def test_that_nothing_can_be_read_stays_until_samples_come() -> None:
+    mute = NoSamplesError("mute")
+    reader, notes, _ = run([[], [], []], [mute, [], mute, [], [BLOCK]])
+    assert notes == ["connected and set up", "mute; trying again", "connected and set up"]
+    reader, notes, _ = run([[], []], [[BLOCK], mute])
+    assert notes[-1] == "mute; trying again"
+    assert reader.trouble == "mute"
 
 
 def test_a_defect_is_told_and_survived() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from omsm_ros.protocols.micro_epsilon import (
     channel_dtype,
     confocal_dtype,
     encode_block,
+    intensity_leads,
 )
 
 FLAGS = (1 << 8 | 1 << 11 | 1 << 15 | 1 << 19, 0)
@@ -72,11 +74,38 @@ def test_a_capacitive_block_by_hand() -> None:
     assert frames["channel 3"].tolist() == [2, 4]
 
 
+def test_numbers_of_frames_and_of_bytes_stand_in_either_order() -> None:
+    head = b"SAEM" + struct.pack("<IIQIHHI", 1, 2, 0b0101, 0, 8, 3, 9)
+    made = BlockDecoder("capacitive", lambda kind: channel_dtype(kind[0]))
+    (found,) = made.feed(head + struct.pack("<6i", *range(6)))
+    assert found.frames.shape == (3, 8)
+    assert found.counter == 9
+    assert made.feed(head[:-8] + struct.pack("<HHI", 7, 3, 9) + bytes(24)) == []
+
+
+NO_PEAK = 0x7FFFFF04
+
+
+@pytest.mark.parametrize(
+    ("words", "leads"),
+    [
+        ([(62_345, 512), (41_000, 9000 << 16 | 800)], False),
+        ([(512, 62_345), (9000 << 16 | 800, 41_000)], True),
+        ([(NO_PEAK, 0)], False),
+        ([(0, NO_PEAK)], True),
+        ([(66_000, 512)], None),  # the distance could be an intensity, too
+        ([(66_000, 512), (-77, 3)], False),
+        ([(5_000_000, 70_000)], None),  # neither
+    ],
+)
+def test_the_words_tell_which_is_the_intensity(words: Any, leads: bool | None) -> None:
+    assert intensity_leads(np.array(words, np.int64), 100_000.0) is leads
+
+
 def test_flags_decide_on_the_frame() -> None:
     assert confocal_dtype((1 << 18, 0)).names == ("distance 1",)
     both = (1 << 15 | 1 << 19, 0)
     assert confocal_dtype(both).names == ("distance 1", "intensity 1")
-    assert confocal_dtype(both, intensity_first=True).names == ("intensity 1", "distance 1")
     video = confocal_dtype((1 << 0 | 1 << 7 | 3 << 19 | 1 << 26, 1 << 15))
     assert video.names == ("video 0", "exposure", "distance 1", "distance 2", "error", "minimum")
     assert video.itemsize == 1024 + 5 * 4

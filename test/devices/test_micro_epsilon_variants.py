@@ -1,0 +1,99 @@
+"""Micro-Epsilon controllers that differ within what is published: greetings, echo, order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from omsm_ros.devices.confocaldt import (
+    ConfocalDtDevice,
+    ConfocalDtEthernetDevice,
+    ConfocalDtSettings,
+)
+from omsm_ros.emulators.chrocodile import AXIS_SCALING
+from omsm_ros.emulators.micro_epsilon import ConfocalDtEmulator, ConfocalDtSerialEmulator
+from omsm_ros.errors import DeviceError
+from omsm_ros.protocols.micro_epsilon import confocal_dtype
+
+from .with_commands import WithCommands
+
+THREE = ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2))
+
+
+class Greeting(ConfocalDtEmulator):
+    """A terminal that greets with a prompt, asks for options, and answers late."""
+
+    greeting = b"\xff\xfb\x01Welcome\r\n->"
+
+    def work(self) -> None:
+        if self._commands is not None and self._commands.sessions and self.greeting:
+            self._commands.write(self.greeting)
+            self.greeting = b""
+        super().work()
+
+
+@pytest.mark.parametrize("kept", ["", "2.5"])
+def test_a_greeting_is_no_answer(kept: str) -> None:
+    run = WithCommands(Greeting, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    usual = run.emulator.obey
+    answers = {"MEASRATE": f"MEASRATE\r\nMEASRATE {kept}\r\n->"} if kept else {}
+    run.emulator.obey = lambda line: answers.get(line, usual(line))
+    if kept:
+        with pytest.raises(DeviceError, match=r"1 kHz was asked for, .* at 2.5 kHz"):
+            run.device.open()
+    else:
+        run.device.open()
+        assert run.device.identity["name"] == "IFC2451"
+
+
+@pytest.mark.parametrize(("said", "fits"), [("1.0", True), ("MEASRATE 5", False), ("", False)])
+def test_the_rate_is_read_back_without_echo_too(said: str, fits: bool) -> None:
+    run = WithCommands(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    usual = run.emulator.obey
+    run.emulator.obey = lambda line: f"{said}\r\n->" if line == "MEASRATE" else usual(line)
+    if fits:
+        run.device.open()
+        return
+    with pytest.raises(
+        DeviceError, match="at 5 kHz" if said else "did not tell its measuring rate"
+    ):
+        run.device.open()
+
+
+def test_a_controller_that_sends_the_intensity_first_is_read(bench: Any) -> None:
+    class Turned(ConfocalDtEmulator):
+        def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:
+            return [
+                turned(piece) if piece else piece
+                for piece in super().pack(measured, counters, times_ns)
+            ]
+
+    run = bench(Turned, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING, wired=(0, 1, 2))
+    run.instrument.faults.drop_out = 7
+    run.run(1.0)
+    run.end()
+    run.check()
+    assert run.delivered > 900
+    np.testing.assert_allclose(run.blocks[-1].distance.intensity, 0.5)
+
+
+def turned(wire: bytes) -> bytes:
+    """A block whose frames have distance and intensity the other way round."""
+    dtype = confocal_dtype((7 << 8 | 1 << 11 | 1 << 12 | 1 << 15 | 1 << 18 | 1 << 19, 0))
+    frames = np.frombuffer(wire[28:], dtype).copy()
+    light = frames["intensity 1"].copy()
+    frames["intensity 1"] = frames["distance 1"]
+    frames["distance 1"] = light
+    return wire[:28] + frames.tobytes()
+
+
+def test_values_of_a_frame_that_are_not_wanted_are_passed_over(bench: Any) -> None:
+    wanted = ConfocalDtSettings(values=("distance", "-", "counter"))
+    run = bench(ConfocalDtSerialEmulator, ConfocalDtDevice, wanted, width=3)
+    run.resolution, run.modulus = 100e-6 / 2**16, 2**18
+    run.run(1.0)
+    run.end()
+    run.check()
+    assert run.delivered > 900
