@@ -23,7 +23,12 @@ from omsm_ros.devices.stream import StreamDevice
 from omsm_ros.devices.transport import Transport
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
-from omsm_ros.protocols.confocaldt_serial import VALUE_BITS, SerialDecoder, distance_of
+from omsm_ros.protocols.confocaldt_serial import (
+    VALUE_BITS,
+    Believed,
+    SerialDecoder,
+    distance_of,
+)
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling
 from omsm_ros.protocols.micro_epsilon import (
     FIRST_ERROR,
@@ -101,19 +106,24 @@ class ConfocalDtDevice(StreamDevice):
         super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
         self._wanted = settings
         self._decoder = SerialDecoder(len(settings.values))
-        self._counted = 0
+        self._believed = Believed(len(settings.values))
+        self._counted = self._unread = 0
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
+        waited = {"unconfirmed": self._believed.unconfirmed}
+        return super().counts() | asdict(self._decoder.statistics) | waited
 
     def _prepare(self) -> None:
         self._decoder.reset()
+        self._believed.reset()
+        self._unread = 0
         if "counter" not in self._wanted.values:
             self._tracker.begin_anew()
 
     def _decode(self, data: bytes) -> Samples:
-        values, spoilt = self._decoder.feed(data)
+        values, spoilt = self._believed.feed(*self._decoder.feed(data))
+        self._unread = 0 if len(values) else self._unread + len(data)
         columns = dict(zip(self._wanted.values, values.T, strict=True))  # "-": the last of them
         samples = np.zeros(len(values), SAMPLE)
         raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
@@ -132,6 +142,7 @@ class ConfocalDtDevice(StreamDevice):
     def _listen_in(self, silent: float) -> None:
         if "counter" not in self._wanted.values:
             self._tracker.begin_anew()
+        self._check_understood(silent, self._unread)
         _must_talk(self._transport.name, self._wanted, silent)
 
 

@@ -6,6 +6,7 @@ in the first value of a frame, 11 high in the others. So a byte that is missing 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ LAST_VALUE = 262_072
 NO_PEAK, BEFORE_RANGE, BEHIND_RANGE, NO_VALUE = 262_076, 262_077, 262_078, 262_079
 VALUE_BITS = 18
 _VALUE_BYTES = 3
+# So many values in a row have their marks by chance once in 64⁵ places, 10⁹ bytes.
+_VALUES_BELIEVED = 5
 
 
 def encode_frames(values: IntArray) -> bytes:
@@ -124,3 +127,46 @@ class SerialDecoder:
             return np.empty(0, np.intp)
         windows = np.lib.stride_tricks.sliding_window_view(raw >> 6, self._size)
         return np.flatnonzero((windows == self._marks).all(axis=1))
+
+
+class Believed:
+    """Frames that are more than chance: enough of them came one after the other at once.
+
+    Nothing but the marks vouches for a value, and in noise, or at another baud rate, every 64th
+    place has them. So after every place where something was wrong frames wait for the next ones.
+
+    unconfirmed: frames that waited in vain
+    """
+
+    def __init__(self, width: int) -> None:
+        """width: values in a frame."""
+        self._width = width
+        self._needed = -(-_VALUES_BELIEVED // width)
+        self.unconfirmed = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Believe nothing, as after connecting anew."""
+        self._waiting: list[tuple[IntArray, IntArray]] = []
+        self._confirmed = False
+
+    def feed(self, values: IntArray, spoilt: IntArray) -> tuple[IntArray, IntArray]:
+        """Of what :meth:`SerialDecoder.feed` returned, and of what waited, what to believe."""
+        found: list[tuple[IntArray, IntArray]] = []
+        breaks = np.flatnonzero(spoilt)
+        edges = np.unique(np.concatenate([[0], breaks, [len(values)]]))
+        for start, end in itertools.pairwise(edges):
+            if spoilt[start]:
+                self.unconfirmed += self._held()
+                self.reset()
+            self._waiting.append((values[start:end], spoilt[start:end]))
+            if self._confirmed or self._held() >= self._needed:
+                self._confirmed = True
+                found += self._waiting
+                self._waiting = []
+        if not found:
+            return np.empty((0, self._width), np.int64), np.empty(0, np.int64)
+        return np.concatenate([f for f, _ in found]), np.concatenate([s for _, s in found])
+
+    def _held(self) -> int:
+        return sum(len(values) for values, _ in self._waiting)

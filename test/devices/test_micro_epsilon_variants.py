@@ -89,6 +89,27 @@ def turned(wire: bytes) -> bytes:
     return wire[:28] + frames.tobytes()
 
 
+NOISE = np.random.default_rng(5)
+# What another baud rate makes of a stream: few bytes, in any order.
+BAUD = np.array([0, 0xF8, 0xFE, 0x80, 0xE0, 0x1E, 0x66, 0x9E, 0xFF], np.uint8)
+
+
+@pytest.mark.parametrize("trigger", ["free_run", "each"])
+@pytest.mark.parametrize("values", [("distance",), ("distance", "counter")])
+@pytest.mark.parametrize("noise", [np.arange(256, dtype=np.uint8), BAUD])
+def test_noise_is_no_sample(bench: Any, noise: Any, values: Any, trigger: str) -> None:
+    class Noise(ConfocalDtSerialEmulator):
+        def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:
+            return [NOISE.choice(noise, 30).tobytes() for _ in counters]
+
+    run = bench(Noise, ConfocalDtDevice, ConfocalDtSettings(values=values, trigger=trigger))
+    run.run(5.0)
+    run.end()
+    assert run.device.statistics.decoded == 0
+    assert run.device.counts()["unconfirmed"] > 0
+    assert "baud rate" in run.troubles[0]
+
+
 def test_values_of_a_frame_that_are_not_wanted_are_passed_over(bench: Any) -> None:
     wanted = ConfocalDtSettings(values=("distance", "-", "counter"))
     run = bench(ConfocalDtSerialEmulator, ConfocalDtDevice, wanted, width=3)
