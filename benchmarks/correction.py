@@ -21,7 +21,7 @@ from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.verification.reversal import sideways_lag
+from omsm_ros.core.verification.reversal import reversal
 from omsm_ros.core.verification.scan_reader import read_scan
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
@@ -227,14 +227,14 @@ def lateral_lag() -> list[Row]:
         made = scan(speed, seed, cell)
         points = corrected(calibration, made.axes, made.distance, lateral_lag=0.0)
         scans.append(read_scan(made.axes, points))
-    found = sideways_lag(scans, calibration)
+    found = reversal(scans, calibration)
     error = abs(found.lag - latency)
     put_right = corrected(calibration, made.axes, made.distance, lateral_lag=found.lag)
     before, after = (_surface_rms(points) / cell.probe.noise for points in (points, put_right))
     return [
-        at_most("sideways lag, error / stated uncertainty", error / found.uncertainty, "1", 2.0),
-        at_most("sideways lag, stated uncertainty", found.uncertainty / MICROSECOND_S, "us", 1.0),
-        at_most("sideways lag corrected: surface rms / probe noise", after, "1", 2.0, before),
+        at_most("lateral lag, error / stated uncertainty", error / found.uncertainty, "1", 2.0),
+        at_most("lateral lag, stated uncertainty", found.uncertainty / MICROSECOND_S, "us", 1.0),
+        at_most("lateral lag corrected: surface rms / probe noise", after, "1", 2.0, before),
     ]
 
 

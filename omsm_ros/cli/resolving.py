@@ -20,8 +20,8 @@ from omsm_ros.core.verification.self_calibration import (
 )
 from omsm_ros.jobs.study_scans import (
     SelfCalibrationOptions,
+    reversal_of,
     self_calibration_of,
-    sideways_lag_of,
 )
 from omsm_ros.readable import measured, percent, quantity
 from omsm_ros.storage.calibration_file import load_calibration, save_calibration
@@ -155,7 +155,7 @@ def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     with progress_bar("correcting", args.json) as progress:
         bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
-        found, accounts = sideways_lag_of(bags, calibration, progress)
+        found, accounts = reversal_of(bags, calibration, progress)
     facts = {
         name: getattr(found, name)
         for name in ("lag", "uncertainty", "lag_of_z", "residual", "used", "latency")
@@ -177,7 +177,7 @@ _MEANINGS = {
 def _show_reversal(facts: Facts) -> None:
     table(
         [
-            ("sideways lag", _time(facts["lag"], facts["uncertainty"])),
+            ("lateral lag", _time(facts["lag"], facts["uncertainty"])),
             ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
             ("meaning", _MEANINGS[facts["latency"]]),
             ("residual", f"{quantity(facts['residual'], 'm')} rms"),

@@ -37,7 +37,7 @@ def compensate_form(
     low_pass: wavelength of which half is compensated [m]; the others as for ``omsm form``
     spiral: feed a turn [m] and places of each of the next cut, for compensation.nc; None: without
 
-    Raises DataError as ``omsm form`` does, and for a wavelength that is finer than the points tell.
+    Raises DataError as ``omsm form`` does, and for a wavelength finer than the points resolve.
     """
     form = measured.form(surface, asked, aperture)
     found = compensation(form.map, surface, low_pass)

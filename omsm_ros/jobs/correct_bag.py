@@ -24,8 +24,8 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
+from omsm_ros.jobs.lateral_errors import LateralErrors, add_lateral_errors
 from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
-from omsm_ros.jobs.sideways_errors import Sideways, add_sideways
 from omsm_ros.storage.cloud_file import PlyWriter
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -76,7 +76,7 @@ def correct_bag(
 ) -> Correction:
     """Correct a bag into ``cloud`` (PLY).
 
-    nominal, lateral: surface, and standard uncertainty of a point sideways [m], which costs
+    nominal, lateral: surface, and standard lateral uncertainty of a point [m], which costs
         height where the surface slopes
     by_stamps: join the streams by their stamps; None: by the trigger counter they share
 
@@ -102,9 +102,9 @@ def correct_bag(
                     if nominal is not None and lateral:
                         points = with_lateral(points, nominal, lateral)
                     found.add(points, ply.write(points))
-        sideways = add_sideways(cloud, scan.options, scan.trace, MOST_DRAWN)
+        shifted = add_lateral_errors(cloud, scan.options, scan.trace, MOST_DRAWN)
         done = _correction(scan, found)
-        return done if sideways is None else _with_sideways(done, sideways)
+        return done if shifted is None else _with_lateral_errors(done, shifted)
 
 
 class _Findings:
@@ -154,14 +154,14 @@ class _Findings:
         return {name: running.statistics() for name, running in self._running.items()}
 
 
-def _with_sideways(done: Correction, sideways: Sideways) -> Correction:
-    if not sideways.heights:
-        return replace(done, faults=(*done.faults, *sideways.warnings))
+def _with_lateral_errors(done: Correction, shifted: LateralErrors) -> Correction:
+    if not shifted.heights:
+        return replace(done, faults=(*done.faults, *shifted.warnings))
     return replace(
         done,
-        budget=done.budget | sideways.heights,
-        largest_uncertainty=sideways.largest,
-        points=sideways.points,
+        budget=done.budget | shifted.heights,
+        largest_uncertainty=shifted.largest,
+        points=shifted.points,
     )
 
 

@@ -122,8 +122,8 @@ def live_light(
 
 
 def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[Reason]:
-    sideways = {s.name for s in stated.of_the_scan() if s.needs_slope and s.standard_uncertainty}
-    missing = sorted(sideways - set(corrector.budget))
+    lateral = {s.name for s in stated.of_the_scan() if s.needs_slope and s.standard_uncertainty}
+    missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
         yield Reason(
             f"{', '.join(missing)} not in the uncertainty of the points: no slopes are known",

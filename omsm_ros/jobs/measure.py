@@ -66,7 +66,7 @@ def measure(
 
     Beside them systematic.npz, what the systematic errors do to the points, for ``omsm form``.
 
-    lateral: standard uncertainty of a point sideways [m]; needs ``nominal`` for the slope
+    lateral: lateral standard uncertainty of a point [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.jobs.correct_bag.correct_bag`
     stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
     register: how the points are registered to ``nominal``; None: they are not

@@ -18,7 +18,7 @@ from omsm_ros.core.verification.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.verification.reversal import SidewaysLag, sideways_lag
+from omsm_ros.core.verification.reversal import Reversal, reversal
 from omsm_ros.core.verification.scan_reader import ScanColumns, ScanReader
 from omsm_ros.core.verification.self_calibration import (
     DEFAULT_CLOCKING_RAD,
@@ -37,15 +37,15 @@ from omsm_ros.storage.recording.topics import AnyBag
 _PLAIN = CorrectionOptions(lateral_lag=0.0)
 
 
-def sideways_lag_of(
+def reversal_of(
     bag_paths: Sequence[AnyBag], calibration: Calibration, progress: Progress = no_progress
-) -> tuple[SidewaysLag, list[Account]]:
+) -> tuple[Reversal, list[Account]]:
     """Lag of the probe against X and C from scans with opposite spindle directions.
 
     Also return where every sample of each scan has gone.
     """
     scans, accounts = _read_scans(bag_paths, calibration, _PLAIN, progress)
-    return sideways_lag(scans, calibration), accounts
+    return reversal(scans, calibration), accounts
 
 
 @dataclass(frozen=True, kw_only=True)

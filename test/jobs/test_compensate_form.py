@@ -73,7 +73,7 @@ def test_the_stated_uncertainty_is_that_of_the_offsets(folder, tmp_path):
 
 def test_a_low_pass_finer_than_the_points_is_refused(folder, tmp_path, capsys):
     assert compensate(folder, tmp_path / "out", "--low-pass", "0.0001") == 2
-    assert "finer than the points tell" in capsys.readouterr().err
+    assert "finer than the points resolve" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

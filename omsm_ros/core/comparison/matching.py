@@ -214,10 +214,10 @@ def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> Flo
 def _not_determined(
     columns: dict[str, FloatArray], of_first: dict[str, FloatArray], place: float
 ) -> dict[str, str]:
-    """Return which freedoms sideways the surface does not tell from the others, and why.
+    """Return which lateral freedoms the surface does not separate from the others, and why.
 
     columns, of_first: of the second and of the first measurement. What both have in common is of
-    the surface; the rest is the noise of their slopes, which tells nothing.
+    the surface; the rest is the noise of their slopes.
     """
     refused: dict[str, str] = {}
     for name in _SIDEWAYS:

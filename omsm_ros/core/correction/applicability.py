@@ -1,7 +1,7 @@
 """Does this calibration belong to these data?
 
 A calibration holds for the probe's rate, exposure and averaging, for the machine and the
-fixture it was made with. What differs is told in full sentences; whoever corrects anyway
+fixture it was made with. What differs is stated in full sentences; whoever corrects anyway
 records them with the result.
 """
 
@@ -32,7 +32,7 @@ def objections(
     sample_period: of the data [s];  polarity: that the correction will use
     settings: as they are now; a name that both sides know must have the same value, one that
         the calibration was made with must not be missing
-    probe: each state that the probe's driver told of itself; what both it and the calibration
+    probe: each state that the probe's driver reported; what both it and the calibration
         know must agree
     """
     found = [*_certificate(calibration, polarity)]
@@ -42,9 +42,9 @@ def objections(
     if settings is not None:
         stated = {n: v for n, v in calibration.settings.items() if not n.startswith(PROBE)}
         found += _differences(stated, settings)
-    for told in probe:
-        known = {n: v for n, v in calibration.settings.items() if n in told}
-        found += _differences(known, told)
+    for state in probe:
+        known = {n: v for n, v in calibration.settings.items() if n in state}
+        found += _differences(known, state)
     return tuple(dict.fromkeys(found))
 
 

@@ -63,12 +63,12 @@ class CorrectionOptions:
     static_gain: probe travel per encoder travel [1]; None takes the calibration's
     accept_other_rate: correct data of another sample period than the calibration's
     max_pending: how long a sample waits for its partner [s]; the newest block always may
-    sources: other uncertainties; None takes what the calibration's certificate tells
+    sources: other uncertainties; None takes what the calibration's certificate states
     lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
         None takes the latency that the calibration's certificate states
     geometry: where the probe sits and looks
     systematic: what else is uncertain of the whole scan; into each point's uncertainty goes what
-        can be known of it there: what shifts points sideways, only with a ``surface``
+        can be known of it there: what shifts points laterally, only with a ``surface``
     surface: nominal, for its slopes
     pitch: of Z, measured; over the geometry's Abbe arm it is taken off the encoder
     trigger: what is stated of the counters of the two streams
@@ -194,7 +194,7 @@ class Corrector:
     def stamp_skew(self) -> float | None:
         """Time of the axes minus time of the distance for the newest common trigger [s].
 
-        Large or drifting, it tells of devices that count different triggers.
+        Large or drifting, it is a sign of devices that count different triggers.
         """
         return self._pairing.stamp_skew
 

@@ -117,7 +117,7 @@ class MachineSources:
         }
 
     def of_the_scan(self) -> tuple[SystematicSource, ...]:
-        """Return the systematic sources that no calibration and no point tells of."""
+        """Return the systematic sources that neither a calibration nor a point has."""
         return tuple(s.systematic() for s in self.stated if s.source not in POINT_SOURCES)
 
 

@@ -1,6 +1,6 @@
 """Which points stand for a whole scan where its systematic errors are judged?
 
-Sensitivity fields are smooth over a scan: a few thousand points, evenly chosen in time, tell what
+Sensitivity fields are smooth over a scan: a few thousand points, evenly chosen in time, show what
 millions would, in memory that does not grow.
 """
 

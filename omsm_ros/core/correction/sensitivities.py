@@ -1,7 +1,7 @@
 """What does each systematic error do to the heights of a scan, per unit of it?
 
 Each function returns the changes of the heights [m] of n points per unit of the error, (k, n) for
-its k independent components, (n,) for one. Those that shift points sideways need their slopes.
+its k independent components, (n,) for one. Those that shift points laterally need their slopes.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def straightness_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
 
 
 def _unknown_over(position: FloatArray, parameters: Parameters) -> FloatArray:
-    """Return components of a curve over ``position`` (n,), smooth over half of it if not told."""
+    """Return components of a curve over ``position`` (n,), smooth over half of it by default."""
     length = parameters.get("correlation_length", float(np.ptp(position)) / 2)
     return components(smooth(length), position)
 
@@ -223,7 +223,7 @@ def of_a_curve(p: ScanPoints, _: Parameters) -> FloatArray:
     return np.ones(len(p))
 
 
-def of_a_curve_sideways(p: ScanPoints, _: Parameters) -> FloatArray:
+def of_a_lateral_curve(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the sum of squares of an unknown curve along X."""
     return np.asarray(_across(p, np.ones(len(p)), np.zeros(len(p))) ** 2, np.float64)
 

@@ -113,7 +113,7 @@ KINDS: dict[str, SourceKind] = {
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,
-        squares=of.of_a_curve_sideways,
+        squares=of.of_a_lateral_curve,
     ),
     "pitch": SourceKind(
         "pitch of Z, over the Abbe arm",

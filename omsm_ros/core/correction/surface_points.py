@@ -20,7 +20,7 @@ class SurfacePoints:
     height: surface height [m] (Eq. 10)
     dynamic_error: (1 - G_m) X_d [m] (Eq. 5)
     uncertainty: standard uncertainty of height [m], k = 1
-    intensity: 0-1, NaN where the device does not tell (float32)
+    intensity: 0-1, NaN where the device does not report it (float32)
     stamp_ns: time of the first point [ns], by the axes' stamps; a number, 0 if there is none
     """
 

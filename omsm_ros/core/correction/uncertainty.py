@@ -2,7 +2,7 @@
 
 ``height = H(z) + distance / g``. The parameters of G carry their covariance through the
 filter: with Σ = L Lᵀ the variance of H(z) is ``Σ_r |F_r z|²``, where ``F_r = Σ_j L_jr ∂G/∂θ_j``
-is again a transfer function. A sideways lag that is wrong by δ moves the point along the
+is again a transfer function. A lateral lag that is wrong by δ moves the point along the
 path; where Z follows the surface that costs ``δ dH(z)/dt`` of height.
 """
 
@@ -54,7 +54,7 @@ class ErrorSources:
     probe_noise: of a reading [m];  probe_resolution: step of a reading [m]
     encoder_noise: of z [m];  encoder_resolution: step of z [m]
     static_gain: of the calibration's static gain [1]
-    lateral_lag: of the sideways lag [s]; it shifts the points along the path
+    lateral_lag: of the delay of X, Y, B and C [s]; it shifts the points along the path
     motion_error: of what follows the motion but not linearly, backlash and the like [m]
     discretisation: of H against G on this motion [m]
     vibration: of the probe against the part while the spindle turns, rms [m]
@@ -142,7 +142,7 @@ def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) ->
 
 
 def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> SurfacePoints:
-    """Return the points with ``lateral`` [m], their standard uncertainty sideways, times the slope.
+    """Return the points with ``lateral`` [m], their lateral standard uncertainty, times the slope.
 
     The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
     """

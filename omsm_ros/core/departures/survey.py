@@ -97,8 +97,8 @@ class Survey:
         past = np.column_stack([np.roll(rate, lag) for lag in range(_LAGS)])
         past[:_LAGS] = 0.0
         left, values, _ = np.linalg.svd(past, full_matrices=False)
-        told = values > _ABOVE_ROUNDING * values[0]
-        return float(np.exp(self.space.score(left[:, told]).log_p)) if np.any(told) else 1.0
+        kept = values > _ABOVE_ROUNDING * values[0]
+        return float(np.exp(self.space.score(left[:, kept]).log_p)) if np.any(kept) else 1.0
 
     def significant(self, but: Collection[str] = ()) -> list[Judged]:
         """Return the significant families, the clearest first, without those named ``but``."""

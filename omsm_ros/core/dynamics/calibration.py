@@ -25,7 +25,7 @@ RESERVED = "accepted with reservations"
 _ROUNDING = 1e-9
 
 PROBE = "probe."
-"""Begins the names of settings that the probe's driver tells by itself."""
+"""Begins the names of settings that the probe's driver reports by itself."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,7 +77,7 @@ class Calibration:
         """Covariance (p, p) by which repeated step tests of one machine scatter.
 
         ``covariance`` holds besides what could hide in every one of them alike. Equal to it
-        where the certificate does not tell the two apart.
+        where the certificate does not separate the two.
         """
         stated = self.certificate.get("noise_covariance")
         if (
@@ -92,7 +92,7 @@ class Calibration:
     def hidden_covariance(self) -> FloatArray:
         """Covariance (p, p) of what the step test could not show, beyond its noise.
 
-        Zero where the certificate does not tell the two apart.
+        Zero where the certificate does not separate the two.
         """
         hidden = self.covariance - self.noise_covariance
         deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -174,14 +174,14 @@ def content_id(content: Mapping[str, object]) -> str:
 def settings_with(
     stated: Mapping[str, object], probe: Sequence[Mapping[str, object]]
 ) -> dict[str, object]:
-    """Return what a calibration belongs to: as ``stated``, and as the probe told of itself.
+    """Return what a calibration belongs to: as ``stated``, and as the probe reported.
 
-    probe: each state that the probe's driver told, during the motion
+    probe: each state that the probe's driver reported during the motion
     Raises CalibrationError where they contradict each other: the motion belongs to no setting.
     """
     merged = dict(stated)
-    for told in probe:
-        for name, value in told.items():
+    for state in probe:
+        for name, value in state.items():
             if merged.setdefault(name, value) != value:
                 raise CalibrationError(
                     f"setting {name} is {merged[name]!r}, then {value!r} of one motion; leave the "

@@ -18,8 +18,9 @@ from omsm_ros.errors import DataError
 MIN_SAMPLES = 64
 # Share of the record that the window fades at either end.
 _FADE = 0.1
-# Harris, Proc. IEEE 66 (1978), the four-term window: side lobes below -92 dB.
-_BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
+BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
+"""Terms of a window whose side lobes are below -92 dB (Harris, Proc. IEEE 66, 1978)."""
+
 # A motion that fills more of the Nyquist band is not resolved by its samples.
 _RESOLVED_SHARE = 0.2
 
@@ -69,7 +70,7 @@ def fast_length(samples: int) -> int:
 
 def _leaking_least(samples: int) -> FloatArray:
     # cos kx as polynomials of cos x: one cosine instead of three.
-    a0, a1, a2, a3 = _BLACKMAN_HARRIS
+    a0, a1, a2, a3 = BLACKMAN_HARRIS
     cosine = np.cos(2 * np.pi / samples * np.arange(samples))
     return np.asarray(a0 - a2 + cosine * (a1 - 3 * a3 + cosine * (2 * a2 + cosine * 4 * a3)))
 

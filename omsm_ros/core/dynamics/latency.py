@@ -1,7 +1,7 @@
 """How much of a calibration's lag is latency of the probe, and how well is that known?
 
 A structure that lags moves Z alone. A probe that is late saw an earlier place of the part,
-so X and C must be delayed too. A step test sees the sum of both and cannot tell them apart;
+so X and C must be delayed too. A step test sees the sum of both and cannot separate them;
 scans of one part at several speeds or in both directions can.
 """
 
@@ -64,7 +64,7 @@ class Latency:
 
     @property
     def resolved(self) -> bool:
-        """False if nothing tells latency from structure."""
+        """False if nothing separates latency from structure."""
         return self.source != UNRESOLVED
 
     @classmethod
@@ -106,7 +106,7 @@ def unresolved(lag: float) -> Latency:
         beside_z_s=spread,
         share=None,
         source=UNRESOLVED,
-        reason="a step test alone cannot tell latency of the probe from lag of the structure",
+        reason="a step test alone cannot separate latency of the probe from lag of the structure",
     )
 
 

@@ -98,7 +98,7 @@ def fit_two_mass(
 
     covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty; a delay
         among them is one more thing that the model has to explain
-    table_mass: m1 [kg], which no response can tell; 1 for all others relative to it
+    table_mass: m1 [kg], which no response determines; 1 for all others relative to it
     frequencies: lines to compare at [Hz]
 
     Raises IdentificationError when G has fewer than two modes to explain.

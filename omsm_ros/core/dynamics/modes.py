@@ -1,4 +1,4 @@
-"""The modes of a response, Eq. 8, and how well an identified one tells them.
+"""The modes of a response, Eq. 8, and how well they are known of an identified one.
 
 G without its delay is a sum over its poles. A conjugate pair adds, up to a part in s,
 ``residue / (s² + 2 ζ ω s + ω²)``; the print lacks the s behind 2 ζ ω.

@@ -18,8 +18,8 @@ from omsm_ros.scipy_parts import sosfilt
 # Position, velocity, acceleration.
 POLYNOMIAL_DEGREE = 2
 START_SAMPLES = 12
-"""Samples that tell how a motion came. A parabola through twelve has 0.74 of one sample's noise at
-its end, through five 0.94; a motion has hardly bent meanwhile."""
+"""Samples from which the past of a motion is taken: a parabola through twelve has 0.74 of one
+sample's noise at its end, through five 0.94, and a motion has hardly bent meanwhile."""
 
 
 def past_motion(first: FloatArray) -> FloatArray:

@@ -131,7 +131,7 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def identifiable(dynamics: TransferFunction, period: float, duration: float) -> bool:
-    """Return whether samples every ``period`` [s] for ``duration`` [s] can tell every pole.
+    """Return whether samples every ``period`` [s] for ``duration`` [s] identify every pole.
 
     One that decays no faster than the record lasts is a line of vibration or a drift; one that
     rings beyond half the sampling rate fits noise, and a filter made of it would ring.

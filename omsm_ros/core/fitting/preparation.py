@@ -59,7 +59,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     """
     check_usable(record)
     motion = _motion(record, source)
-    steps = _seen_whole(find_steps(motion, record.sample_period), record)
+    steps = _recorded_whole(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)
     if steps.edges:
         # Of a motion that never rests a lag of half a period is another gain; the fit tells.
@@ -113,7 +113,7 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
         used=used,
         period=record.sample_period,
         background=np.column_stack([np.ones(samples), ramp]),
-        rate=2 * np.pi * content_frequency(motion, record.sample_period),
+        rate=2 * np.pi * input_bandwidth(motion, record.sample_period),
         noise=steps.noise,
     )
 
@@ -149,7 +149,7 @@ def _after_loss(record: MotionRecord) -> BoolArray:
     return np.asarray(touched > 0.5)
 
 
-def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
+def _recorded_whole(steps: Steps, record: MotionRecord) -> Steps:
     """Return the steps without those edges of which a part was lost."""
     if record.z_lost is None:
         return steps
@@ -158,8 +158,8 @@ def _seen_whole(steps: Steps, record: MotionRecord) -> Steps:
     return replace(steps, edges=whole)
 
 
-def content_frequency(motion: FloatArray, sample_period: float) -> float:
-    """Return the frequency [Hz] below which 99 % of the velocity's energy lies."""
+def input_bandwidth(motion: FloatArray, sample_period: float) -> float:
+    """Return the frequency [Hz] below which 99 % of the velocity's energy lies, noise and all."""
     power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
     # Compared without a division: of no motion, or of one too small to square, all is at rest.
     place = int(np.searchsorted(np.cumsum(power), 0.99 * np.sum(power))) + 1

@@ -49,7 +49,7 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
     cells = Cells.of(map_)
     if low_pass < _LEAST_CELLS * cells.pitch:
         raise DataError(
-            f"low-pass of {low_pass!r} m is finer than the points tell, expected "
+            f"low-pass of {low_pass!r} m is finer than the points resolve, expected "
             f"{_LEAST_CELLS * cells.pitch!r} m or more; measure more points, or compensate less"
         )
     smooth = cells.smoothed(np.concatenate([[cells.mean], cells.effects]), low_pass)

@@ -2,8 +2,8 @@
 
 Normal equations in portions that stay in the processor's cache, solved by Cholesky once they are
 found well conditioned: an equilibrated Gram matrix of condition κ costs κ times the rounding of a
-float, so that 10⁶ leaves ten digits. Where the points cover too little of the disc for the terms to
-be told apart, those of highest order are left out, and are not evaluated.
+float, so that 10⁶ leaves ten digits. Where the points cover too little of the disc to
+separate the terms, those of highest order are left out, and are not evaluated.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ZernikeFit:
     """Coefficients (k,) [m] of ``terms``, each one at the rim of ``disc``.
 
     covariance: from the scatter of the points about the fit (k, k) [m²]
-    left_out: terms that the points do not tell apart
+    left_out: terms that the points do not separate
     effects: coefficients of the further deviations (k, e) [m]
     """
 
@@ -76,7 +76,7 @@ def fit_zernikes(
     effects: further deviations (e, n) [m] whose coefficients (k, e) are wanted of the same fit
 
     The covariance holds errors that hang together over 128 successive points. Raises DataError for
-    fewer points than terms, or points that tell no term.
+    fewer points than terms, or points that determine no term.
     """
     if len(x) < max(2 * len(terms), 8):
         raise DataError(
@@ -86,9 +86,9 @@ def fit_zernikes(
     more = np.empty((0, len(x))) if effects is None else effects
     values = np.concatenate([deviation[np.newaxis], more])
     gram, right = _normal_equations(x, y, values, terms, disc, weights)
-    told = _told_apart(gram, terms)
-    gram, right = gram[np.ix_(told, told)], right[told]
-    used = tuple(terms[k] for k in told)
+    kept = _separable(gram, terms)
+    gram, right = gram[np.ix_(kept, kept)], right[kept]
+    used = tuple(terms[k] for k in kept)
     scale = 1 / np.sqrt(np.diag(gram))
     root = np.linalg.cholesky(gram * np.outer(scale, scale))
     inverse = np.linalg.inv(root) * scale
@@ -125,17 +125,17 @@ def _normal_equations(
     return gram, right
 
 
-def _told_apart(gram: FloatArray, terms: Sequence[Term]) -> list[int]:
+def _separable(gram: FloatArray, terms: Sequence[Term]) -> list[int]:
     """Return the places of the terms up to the highest order that is well conditioned."""
     for order in range(max(t.n for t in terms), -1, -1):
-        told = [k for k, t in enumerate(terms) if t.n <= order]
-        own = np.diag(gram)[told]
+        kept = [k for k, t in enumerate(terms) if t.n <= order]
+        own = np.diag(gram)[kept]
         if np.all(own > 0):
             scale = 1 / np.sqrt(own)
-            values = np.linalg.eigvalsh(gram[np.ix_(told, told)] * np.outer(scale, scale))
+            values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] * np.outer(scale, scale))
             if values[0] > 0 and values[-1] / values[0] < _WORST_CONDITION:
-                return told
-    raise DataError("the points tell no Zernike term; check the aperture and the weights")
+                return kept
+    raise DataError("the points determine no Zernike term; check the aperture and the weights")
 
 
 def _scores(

@@ -95,7 +95,9 @@ def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: floa
 
 def _what_to_check(clearly_better: int | None) -> str:
     if clearly_better is not None:
-        return f"the order asked for is wrong, {clearly_better} poles tell far more"
+        return (
+            f"the order asked for is wrong, {clearly_better} poles describe the record far better"
+        )
     return "check for backlash, a loose mount or a clipped probe"
 
 
@@ -109,7 +111,7 @@ def separable_gain(uncertainty: float, limit: float) -> Finding:
         return Finding()
     return Finding(
         reasons=(
-            "the motion does not tell the static gain from the dynamics (its gain alone is "
+            "the motion does not separate the static gain from the dynamics (the gain alone is "
             f"uncertain by {percent(COVERAGE_FACTOR * uncertainty)}): move in steps, or "
             "at several frequencies at once",
         )

@@ -92,7 +92,7 @@ def no_surer(
     """Return what is known of an order that was asked for, no surer than the ``free`` choice.
 
     Too low an order has few parameters, so little noise in them, and a bias beyond what the
-    motion excites, which no residual shows. The free choice tells how much it leaves open.
+    motion excites, which no residual shows. The free choice says how much stays open.
     """
     mine, other = model.chosen.fit, free.chosen.fit
     if mine.structure == other.structure or mine.structure.contains(other.structure):

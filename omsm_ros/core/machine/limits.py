@@ -1,6 +1,6 @@
 """How fast can the machine and the probe run a path, apart from its dynamic error?
 
-Each limit compares one quantity of the path with what is allowed, and tells how many times
+Each limit compares one quantity of the path with what is allowed, and says how many times
 as fast the same path may be run until the two are equal. Run k times as fast, velocities grow
 by k, accelerations by k² and jerks by k³. What is not declared is named, not assumed harmless.
 """

@@ -85,11 +85,11 @@ def plan_steps(
     """Return ``count`` steps up and as many down, dithered within ``sample_period`` [s].
 
     Half of the way up, all of it down, half of it up again: a motion about the middle of its
-    travel tells a slow relaxation from a drift twice as well as one to its end and back.
+    travel separates a slow relaxation from a drift twice as well as one to its end and back.
 
-    step: [m];  second_step: of every other one [m], None for equal steps: two heights tell
-        what is not linear (backlash, friction, stiffening) from what only lags
-    dwell: from edge to edge [s], as long as the slowest relaxation that is to be told from gain
+    step: [m];  second_step: of every other one [m], None for equal steps: two heights
+        separate what is not linear (backlash, friction, stiffening) from what only lags
+    dwell: from edge to edge [s], as long as the slowest relaxation to be separated from gain
     rise: of an edge [s]
     half_range: of the probe [m], which must hold the whole travel
 

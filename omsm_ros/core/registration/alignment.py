@@ -94,7 +94,7 @@ class SphereScanReader:
         self._axes.append(block)
 
     def add(self, points: SurfacePoints) -> None:
-        """Take in the next points, corrected with no geometry and no sideways lag."""
+        """Take in the next points, corrected with no geometry and no lateral lag."""
         if not len(points):
             return
         scan = sphere_scan_of(points, self._axes)
@@ -110,7 +110,7 @@ class SphereScanReader:
 
 
 def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
-    """The scan behind points that were corrected with no geometry and no sideways lag.
+    """The scan behind points that were corrected with no geometry and no lateral lag.
 
     axes: the blocks of that one scan. Raises DataError for a point that is in none of them.
     """

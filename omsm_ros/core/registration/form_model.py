@@ -44,10 +44,10 @@ _TURNS, _SETTLED = 300, 1e-3
 # Sizes of optical figure errors fall with the second to fourth power of their order.
 _STEEPEST = 4
 # Beneath a picometre a form error is of no interest, and a variance of zero has no inverse; nor
-# beneath a tenth of the variance that noise leaves of a term, for nothing could tell it.
+# beneath a tenth of the variance that noise leaves of a term, for nothing could show it.
 _LEAST_M = 1e-12
 _LEAST_SHARE = 0.1
-# No measurement knows a term better, however many points it has; and beyond it what tells form
+# No measurement knows a term better, however many points it has; and beyond it what separates form
 # from pose, a billionth of their products, drowns in rounding.
 _BEST_KNOWN_M = 1e-11
 # Ten times what is left after a plain fit: most of the form may have gone into the pose.
@@ -122,7 +122,7 @@ class NormalEquations:
     points: how many came;  square, total: sums of their squared residuals and deviations [m²]
     gram: (columns, columns + 1 + sources)
     scores: of each column, the sum over groups of 128 successive points of the squared sum of its
-        products with the residual: what tells errors that hang together
+        products with the residual, which shows errors that hang together
     """
 
     columns: int

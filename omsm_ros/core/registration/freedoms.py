@@ -119,7 +119,7 @@ def weakest(
     k = min(found)[1]
     unit = "rad" if names[k] == "clocking" else "m"
     return names[k], (
-        f"form looks like it here: the points tell it to {quantity(spread[k], unit, 2)} only, "
+        f"form looks like it here: the points determine it to {quantity(spread[k], unit, 2)} only, "
         f"which is {quantity(own[k] * spread[k], 'm', 2)} rms of form, and do not show that the "
         f"part was moved ({quantity(values[k], unit, 2)} was found); what that opens widens every "
         "figure"

@@ -99,7 +99,7 @@ class Open(NamedTuple):
 
     unknown: by freedom that no surface determines: what it does to each of the others, in first
         and second order
-    held: mean products of what was held and what the points tell of it (h, h)
+    held: mean products of what was held, value and covariance together (h, h)
     """
 
     unknown: dict[str, dict[str, FloatArray]]

@@ -109,7 +109,7 @@ def _determined(
     aperture: Aperture | None,
     at: Placement,
 ) -> Freedoms:
-    """Return which freedoms the surface tells apart where the part is ``at``."""
+    """Return which freedoms the surface determines where the part is ``at``."""
     points = usable(placed(surface, at, chosen), aperture)
     columns = freedom_columns(at, points, FREEDOMS)
     return determined(asked, columns @ columns.T, len(points.x))
@@ -130,7 +130,7 @@ class _Stand(NamedTuple):
 def _useful(
     fit: _Fit, stand: _Stand, chosen: Portion, asked: Sequence[str], open_: Open
 ) -> tuple[_Fit, _Stand, Open]:
-    """Hold, of what nobody asked for by name, what the points do not tell well enough."""
+    """Hold, of what nobody asked for by name, what the points do not determine well enough."""
     names, at = fit.names, stand.at
     values = np.array([at.value(name) for name in names])
     covariance = stand.found.covariance[: len(names), : len(names)]

@@ -10,7 +10,7 @@ from omsm_ros.core.dynamics.response_band import ResponseLimits, response_band
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.order_choice import held_out_rms
 from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.fitting.preparation import Prepared, content_frequency, from_rest_to_rest
+from omsm_ros.core.fitting.preparation import Prepared, from_rest_to_rest, input_bandwidth
 from omsm_ros.core.fitting.steps import LEAST_SAMPLES, Steps, held_out, sample_noise
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.residual_tests import independence, whiteness
@@ -102,7 +102,7 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
         used=used,
         period=_NOMINAL_PERIOD_S,
         background=np.column_stack([np.ones(samples), np.linspace(-1.0, 1.0, samples)]),
-        rate=2 * np.pi * content_frequency(input, _NOMINAL_PERIOD_S),
+        rate=2 * np.pi * input_bandwidth(input, _NOMINAL_PERIOD_S),
     )
     steps = Steps((), moving, sample_noise(input), float(np.ptp(input)))
     return Prepared(problem, steps, 0)

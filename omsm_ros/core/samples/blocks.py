@@ -121,7 +121,7 @@ class DistanceBlock(Block):
 
     The distance is NaN where the status is not OK, whatever was given.
     An empty status means that every sample is OK, an empty intensity that the
-    device does not tell.
+    device does not report it.
     """
 
     distance: FloatArray

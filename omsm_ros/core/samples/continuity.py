@@ -1,8 +1,8 @@
 """Does a block continue its stream, or what happened in between?
 
 A device counts its triggers; a count that wraps is continued by its driver and never seen
-here. The count tells gaps, repetitions and late arrivals; together with the time stamp it
-tells a device that has begun to count anew. Stamps may advance more slowly than the count
+here. The count shows gaps, repetitions and late arrivals; together with the time stamp it
+shows a device that has begun to count anew. Stamps may advance more slowly than the count
 times the sample period, when a recording is played in time lapse.
 """
 

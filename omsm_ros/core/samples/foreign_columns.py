@@ -67,8 +67,8 @@ COUNT = "count"
 # 0.4 MB of axes in a message.
 _BLOCK_SAMPLES = 10_000
 _NOT_RISING = (
-    "import the parts before and after it one by one, or, if time is told too coarsely, leave it "
-    "out and state sample_period"
+    "import the parts before and after it one by one, or, if time is written too coarsely, leave "
+    "it out and state sample_period"
 )
 # A time that is off by more lies nearer to no sample than to its neighbour.
 _MOST_JITTER = 0.25
@@ -135,7 +135,7 @@ class ColumnMap:
 
     @property
     def dated(self) -> bool:
-        """Return whether the column of time tells instants since 1970."""
+        """Return whether the column of time holds instants since 1970."""
         return "time" in self.columns and self.columns["time"].unit in (DATE, UNIX)
 
     def names(self, channels: tuple[str, ...]) -> list[str]:

@@ -44,10 +44,10 @@ def _continues(first: B, length: int, block: B) -> bool:
     if block.first_sample != first.first_sample + length or block.sample_period != period:
         return False
     off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
-    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _told(first) == _told(block)
+    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _given(first) == _given(block)
 
 
-def _told(block: B) -> tuple[str, ...]:
+def _given(block: B) -> tuple[str, ...]:
     """Return names of the channels that have samples: an empty one means something of its own."""
     return tuple(name for name in _channels(block) if len(getattr(block, name)))
 

@@ -76,7 +76,7 @@ class Slip:
     """What the stamps say of two counters.
 
     samples: periods by which axes are stamped later at equal counts, 0 as long as they agree
-    seen_from: a slip of fewer samples cannot be told from the stamps' scatter; None = not judged
+    seen_from: a slip of fewer samples does not stand out of the stamps' scatter; None = not judged
     remedy: in words for people
     """
 
@@ -117,7 +117,7 @@ class StampLine:
         return end
 
     def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
-        """Return the time of the sample ``count`` [ns], None where no block told it."""
+        """Return the time of the sample ``count`` [ns], None where no block says it."""
         if self._current is None or self._current[0] != session:
             return None
         return self._current[2] + (count - self._current[1]) * period_ns
@@ -203,7 +203,7 @@ class SlipWatch:
         self.found = self._state if self._state.samples else self.found
 
     def _window(self) -> FloatArray | None:
-        """Return the skews to be judged [samples], None if they tell nothing."""
+        """Return the skews to be judged [samples], None if they say nothing."""
         seen = np.array(self._seen, np.float64).reshape(-1, 5)
         starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
         if min(map(len, starts)) < _LEAST_STAMPS:

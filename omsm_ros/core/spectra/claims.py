@@ -125,9 +125,9 @@ def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Cla
     found = []
     for one in alive:
         rivals = [t for t in alive if _is_rival(one, t)]
-        telling = tuple(key for key in one.present if _tells(scans[key[0]], one, rivals))
-        if telling:
-            found.append(Claim(one.kind, one.hypothesis, telling))
+        decisive = tuple(key for key in one.present if _decides(scans[key[0]], one, rivals))
+        if decisive:
+            found.append(Claim(one.kind, one.hypothesis, decisive))
     return tuple(_least_folded(found))
 
 
@@ -138,7 +138,7 @@ def _is_rival(one: Tested, other: Tested) -> bool:
     return one.kind != other.kind and not other.hypothesis.folds
 
 
-def _tells(scan: StudiedScan, one: Tested, rivals: Sequence[Tested]) -> bool:
+def _decides(scan: StudiedScan, one: Tested, rivals: Sequence[Tested]) -> bool:
     place = place_in(scan, one.hypothesis)
     return all(apart(place, place_in(scan, rival.hypothesis)) for rival in rivals)
 

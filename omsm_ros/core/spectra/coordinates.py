@@ -1,4 +1,4 @@
-"""In what is a line periodic? Over time, path, radius, turns: how far each tells it apart.
+"""In what is a line periodic? Over time, path, radius, turns: how far each decides.
 
 A scan at a steady pace cannot: its coordinates are proportional. Where the pace changes, a line
 is sharp in its own coordinate only.

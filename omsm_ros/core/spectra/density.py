@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.dynamics.discretisation_error import BLACKMAN_HARRIS
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
-
-# Blackman and Harris (1978), four terms: side lobes below 1e-9 of the power, so that millimetres
-# of travel hide no nanometre.
-_WINDOW_TERMS = (0.35875, -0.48829, 0.14128, -0.01168)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +30,12 @@ class Density:
 
 
 def window(count: int) -> FloatArray:
-    """Return the window (n,), scaled to a mean square of one."""
+    """Return the window (n,), scaled to a mean square of one.
+
+    Side lobes below 1e-9 of the power, so that millimetres of travel hide no nanometre.
+    """
     phase = 2 * np.pi * np.arange(count) / count
-    shape = sum(a * np.cos(k * phase) for k, a in enumerate(_WINDOW_TERMS))
+    shape = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
     return np.asarray(shape / np.sqrt(np.mean(shape**2)))
 
 

@@ -14,7 +14,7 @@ from omsm_ros.core.spectra.scan_signal import ScanSignal
 from omsm_ros.errors import DataError
 
 AXES = ("x", "y", "z")
-# As few frequencies as a floor of noise can be told from.
+# As few frequencies as a floor of noise can be found among.
 _LEAST_SAMPLES = 256
 
 

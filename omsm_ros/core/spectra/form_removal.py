@@ -77,7 +77,7 @@ class Formless:
 
     residual: what is left (n,) [m];  degree: of the polynomials;  removed: rms of the form [m]
     orders: what repeats with the spindle, taken out as well
-    on_circle: True where figure and spindle cannot be told apart, for there is one radius
+    on_circle: True where figure and spindle are not separable, for there is one radius
     """
 
     residual: FloatArray

@@ -32,7 +32,7 @@ def hertz(frequency: float) -> str:
 
 
 def to_decide(scans: Sequence[StudiedScan], own: int, line: Line, kinds: set[str]) -> str:
-    """Return what would tell the kinds that are left apart."""
+    """Return what would decide between the kinds that are left."""
     scan, found = scans[own], []
     others = [s for k, s in enumerate(scans) if k != own]
     if not any(_other_pace(scan, s, line) for s in others):

@@ -1,6 +1,6 @@
 """What is each line of a scan: on the part, a vibration, folded, the spindle, an artefact?
 
-A kind is named only where some scan tells it from all others: its line is there, where no other
+A kind is named only where some scan separates it from all others: its line is there, where no other
 kind would put it, and is missing in no scan that would have to show it; or where the accelerometer
 feels it; or where the scan's own pace changed, so that it is sharp in one kind only. Else it is
 undecided.
@@ -337,6 +337,6 @@ def _with_true_frequency(scans: Sequence[StudiedScan], named: dict[Key, Named], 
         if abs(float(folded_frequency(row.frequency, rate)) - seen) <= 1 / scan.signal.duration:
             text = f"{scans[other].signal.name} tells its frequency: {needs.hertz(row.frequency)}"
             kind = FOLDED if row.frequency > rate / 2 else VIBRATION
-            told = (own.evidence[0], text)
-            return replace(own, kind=kind, frequency=row.frequency, evidence=told)
+            both = (own.evidence[0], text)
+            return replace(own, kind=kind, frequency=row.frequency, evidence=both)
     return own

@@ -13,7 +13,7 @@ from omsm_ros.errors import DataError
 
 TIME, PATH, RADIUS, TURN = "time", "path", "radius", "turn"
 
-# As few frequencies as a floor of noise can be told from.
+# As few frequencies as a floor of noise can be found among.
 _LEAST_POINTS = 256
 # Below a hundredth of a turn the spindle is at rest but for its encoder's noise.
 _LEAST_TURN = 0.01
@@ -171,7 +171,7 @@ class Sampling:
     """How finely a scan samples the part at one radius.
 
     radius: [m];  distance: between samples along the path [m] (the paper's Table 1)
-    shortest_wavelength: that is told from its folded image, twice the distance [m]
+    shortest_wavelength: that is not confused with its folded image, twice the distance [m]
     """
 
     radius: float

@@ -107,7 +107,7 @@ def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArr
     """Return the covariance (2k, 2k) of relative gain, then phase [rad], at ``lines`` (k,) [Hz].
 
     That of the noise: what could hide in a step test hides in each of one machine alike, and
-    does not tell two of them apart.
+    does not distinguish two of them.
     """
     jacobian = relative_response_jacobian(calibration.dynamics, lines).reshape(2 * len(lines), -1)
     return np.asarray(jacobian @ calibration.noise_covariance @ jacobian.T)

@@ -62,7 +62,7 @@ def counter_offset(
     """
     if np.count_nonzero(ok) < max(_LEAST_SAMPLES, 4 * most):
         raise DataError(
-            f"{np.count_nonzero(ok)} samples with a distance cannot tell an offset of up to "
+            f"{np.count_nonzero(ok)} samples with a distance do not determine an offset of up to "
             f"{most} samples; record {max(_LEAST_SAMPLES, 4 * most)} or more before a fixed target"
         )
     left = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, most)

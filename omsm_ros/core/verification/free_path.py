@@ -67,7 +67,7 @@ def check_path(
 def excited_bands(z: FloatArray, sample_period: float) -> tuple[tuple[float, float], ...]:
     """Return the bands of a hertz (from, to) in which a motion ``z`` (n,) [m] has power.
 
-    Elsewhere the instantaneous frequency of a noisy motion strays, and nothing is told there.
+    Elsewhere the instantaneous frequency of a noisy motion strays, and there is no result.
     """
     power = abs(np.fft.rfft(_centred(z) * signal.windows.tukey(len(z), _TAPERED))) ** 2
     band = np.floor(np.arange(len(power)) / (len(z) * sample_period)).astype(np.int64)

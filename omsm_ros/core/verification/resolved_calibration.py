@@ -1,4 +1,4 @@
-"""A calibration from what scans of one part tell, with or without a step test before."""
+"""A calibration from scans of one part, with or without a step test before."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ def after_step_test(calibration: Calibration) -> Prior:
 
 
 def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
-    """Return ``calibration`` with what the scans corrected with it tell besides.
+    """Return ``calibration`` with what the scans corrected with it add to it.
 
-    What they tell of lag and curvature narrows the covariance Σ of all parameters: with J the
+    What they say of lag and curvature narrows the covariance Σ of all parameters: with J the
     Jacobian of the two, and K = Σ Jᵀ (J Σ Jᵀ)⁻¹, to ``Σ - K (J Σ Jᵀ - P) Kᵀ``, P what is left.
     """
     g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
@@ -224,7 +224,7 @@ def _entries(found: SelfCalibration) -> dict[str, object]:
 
 
 def untold(found: SelfCalibration) -> list[str]:
-    """Return what the scans could not tell, why, and what would tell it."""
+    """Return what the scans did not determine, why, and what would."""
     told = []
     if not found.known[LATENCY]:
         told.append(

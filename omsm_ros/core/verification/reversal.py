@@ -1,4 +1,4 @@
-"""Is the lag latency, or mechanics? Two scans in opposite directions tell.
+"""Is the lag latency, or mechanics? Two scans in opposite directions decide.
 
 A late probe looks where the workpiece was a moment ago: each height belongs to a point
 ``lag`` earlier on the path, and turning the spindle the other way shifts it to the other
@@ -23,8 +23,8 @@ from omsm_ros.errors import DataError
 
 
 @dataclass(frozen=True)
-class SidewaysLag:
-    """How late the probe's reading is against X and C.
+class Reversal:
+    """What scans in opposite directions say: how late the probe's reading is against X and C.
 
     lag, uncertainty: [s], k = 1;  lag_of_z: of the calibration at low frequency [s]
     residual: rms that lag and surface leave [m];  used: points fitted
@@ -41,9 +41,9 @@ class SidewaysLag:
     calibration: Calibration
 
 
-def sideways_lag(
+def reversal(
     scans: Sequence[ScanColumns], calibration: Calibration, harmonics: int = DEFAULT_HARMONICS
-) -> SidewaysLag:
+) -> Reversal:
     """Return the lag of the probe against X and C from scans in opposite directions.
 
     scans: corrected with ``calibration``, two or more, of one surface
@@ -58,7 +58,7 @@ def sideways_lag(
     found = self_calibrate(scans, after_step_test(calibration), harmonics)
     lag, of_z = float(found.values[LATENCY]), calibration.dynamics.low_frequency_delay
     uncertainty = float(found.covariance[LATENCY, LATENCY] ** 0.5)
-    return SidewaysLag(
+    return Reversal(
         lag=lag,
         uncertainty=uncertainty,
         lag_of_z=of_z,

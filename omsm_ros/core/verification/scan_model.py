@@ -5,9 +5,9 @@ after a correction that is to be judged: its lag is wrong by δ, its curvature (
 s²) by κ, its static gain by the share ε, and the probe is late against the slides by τ.
 Of its own each scan but the first has a drift, its clocking, and shift and tilt of the part.
 
-To first order two speeds or directions tell ``δ - τ`` from S, for its mark grows with the
-speed; a following error, or knowledge of G from a step test, tells δ from τ. Clocking leaves
-the same mark as a lag at a steady speed: how well C repeats limits what can be told.
+To first order two speeds or directions separate ``δ - τ`` from S, for its mark grows with the
+speed; a following error, or knowledge of G from a step test, separates δ from τ. Clocking leaves
+the same mark as a lag at a steady speed: how well C repeats limits what is identifiable.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class ScanReader:
         self._axes.append(block)
 
     def add(self, points: SurfacePoints) -> None:
-        """Take in the next points, corrected with no geometry and no lateral delay."""
+        """Take in the next points, corrected with no geometry and no lateral lag."""
         self.points += len(points)
         self._points.append(points)
         if sum(map(len, self._points)) > _PORTION_SAMPLES:

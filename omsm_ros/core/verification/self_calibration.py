@@ -1,4 +1,4 @@
-"""What do scans of one part, at different speeds or directions, tell of the dynamics?
+"""What do scans of one part, at different speeds or directions, say of the dynamics?
 
 The surface is common to all scans and eliminated (:mod:`eliminated_surface`); what grows with
 the speed, or turns with the direction, remains (:mod:`scan_model`). Gauss-Newton on latency
@@ -44,7 +44,7 @@ _FREE = 1e6
 # Where the noise is looked for; the residuals tell it after one step.
 _NOISE_M = 10e-9
 # Of the prior's variance; rounding leaves less.
-_TELLING = 1e-6
+_DETERMINED = 1e-6
 # Keep what is exactly known from dividing by zero: picometres and picoradians; ns, as². Far below
 # any effect.
 _LEAST_STATED = 1e-12
@@ -90,11 +90,11 @@ WIDE_GAIN = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """What the scans tell, in the names of :mod:`scan_model`.
+    """What the scans determine, in the names of :mod:`scan_model`.
 
     values, covariance: of lag, curvature, gain, latency, with the prior, (4,) and (4, 4); the
         gain stays as it was, and its uncertainty counts
-    known: which of them the scans or the prior tell, (4,);  speeds: of the scans [rad/s]
+    known: which of them the scans or the prior determine, (4,);  speeds: of the scans [rad/s]
     residual: rms [m];  followed: standard uncertainty that the four leave on the heights of
         this surface, rms [m];  agreement: of the scans with each other
     surprise: χ² of lag and curvature against the prior, 2 degrees of freedom
@@ -128,9 +128,9 @@ class SelfCalibration:
 def self_calibrate(
     scans: Sequence[ScanColumns], prior: Prior, harmonics: int = DEFAULT_HARMONICS
 ) -> SelfCalibration:
-    """Return what two or more scans of one part tell of the dynamics.
+    """Return what two or more scans of one part say of the dynamics.
 
-    Raises DataError where they cannot tell anything: one speed and direction, a surface
+    Raises DataError where they say nothing: one speed and direction, a surface
     without slope along the path, or a part that was re-mounted.
     """
     model = ScanModel(scans, harmonics)
@@ -175,7 +175,7 @@ class _Fit:
         self._iterate()
 
     def without(self, index: int) -> _Fit:
-        """Return the same fit with one of the four left as it is, for the scans cannot tell it."""
+        """Return the same fit with one of the four held, which the scans do not determine."""
         covariance = _held(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
         return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
@@ -189,7 +189,7 @@ class _Fit:
 
     @property
     def unknown(self) -> BoolArray:
-        """Which of the four neither the prior nor the scans tell, (4,)."""
+        """Which of the four neither the prior nor the scans determine, (4,)."""
         inverse = _inverse(self._matrix)
         posterior = np.diag(inverse + self._by_gain(inverse))[:DYNAMIC]
         assumed = np.diag(self._prior.covariance)
@@ -318,5 +318,5 @@ def _surprise(
     spread, directions = np.linalg.eigh(expected)
     moved = directions.T @ (values / unit)
     # Where the scans tell next to nothing, nothing moves.
-    telling = spread > _TELLING
-    return float(np.sum(moved[telling] ** 2 / spread[telling]))
+    known = spread > _DETERMINED
+    return float(np.sum(moved[known] ** 2 / spread[known]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.fitting.periodic_input import close_period
-from omsm_ros.core.fitting.preparation import content_frequency, from_rest_to_rest, prepare
+from omsm_ros.core.fitting.preparation import from_rest_to_rest, input_bandwidth, prepare
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError
@@ -59,7 +59,7 @@ def test_content_is_counted_by_the_energy_of_the_velocity(share, expected):
     time = np.arange(10_000) * 1e-3
     slow, fast = (np.sin(2 * np.pi * f * time) / f for f in (2.0, 20.0))
     motion = slow + np.sqrt(share / (1 - share)) * fast
-    assert content_frequency(motion, 1e-3) == pytest.approx(expected, abs=0.3)
+    assert input_bandwidth(motion, 1e-3) == pytest.approx(expected, abs=0.3)
 
 
 def test_the_probes_gain_must_be_plausible():
@@ -73,10 +73,10 @@ def test_a_quantised_probe_is_not_taken_for_a_clipped_one():
     assert prepare(coarse, "encoder").problem.used.any()
 
 
-def test_content_frequency_is_that_of_the_motion():
+def test_the_bandwidth_is_that_of_the_motion():
     time = np.arange(10_000) * 1e-3
-    assert content_frequency(np.sin(2 * np.pi * 7 * time), 1e-3) == pytest.approx(7.0, abs=0.3)
-    assert content_frequency(STEPS, 1e-3) > 30
+    assert input_bandwidth(np.sin(2 * np.pi * 7 * time), 1e-3) == pytest.approx(7.0, abs=0.3)
+    assert input_bandwidth(STEPS, 1e-3) > 30
 
 
 def test_a_motion_that_breaks_off_ends_at_rest_and_without_new_content():
@@ -115,4 +115,4 @@ def test_a_fade_shorter_than_a_sample_changes_nothing(samples: int, period: floa
 
 def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
     motion = 1e-300 * np.arange(100.0)
-    assert content_frequency(motion, 1e-3) == pytest.approx(1 / (100 * 1e-3))
+    assert input_bandwidth(motion, 1e-3) == pytest.approx(1 / (100 * 1e-3))

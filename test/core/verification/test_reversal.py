@@ -1,4 +1,4 @@
-"""The sideways lag, recovered from two scans of the twin in opposite directions."""
+"""The lateral lag, recovered from two scans of the twin in opposite directions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
-from omsm_ros.core.verification.reversal import sideways_lag
+from omsm_ros.core.verification.reversal import reversal
 from omsm_ros.core.verification.scan_reader import ScanColumns, ScanReader, read_scan
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record
@@ -70,7 +70,7 @@ def late_scans() -> list[ScanColumns]:
 
 
 def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanColumns]) -> None:
-    found = sideways_lag(late_scans, LATE)
+    found = reversal(late_scans, LATE)
     assert found.uncertainty < 1e-6
     assert abs(found.lag - LATENCY) < 3 * found.uncertainty
     assert found.residual == pytest.approx(10.5e-9, rel=0.05)
@@ -78,7 +78,7 @@ def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanColu
 
 def test_a_mechanical_lag_is_not_sideways() -> None:
     scans = [scan(30.0, 1, MECHANICAL, Cell()), scan(-30.0, 2, MECHANICAL, Cell())]
-    found = sideways_lag(scans, MECHANICAL)
+    found = reversal(scans, MECHANICAL)
     assert abs(found.lag) < 3 * found.uncertainty
     assert found.latency is False
     assert found.lag_of_z == pytest.approx(0.3397e-3, abs=1e-7)
@@ -87,7 +87,7 @@ def test_a_mechanical_lag_is_not_sideways() -> None:
 def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[ScanColumns]) -> None:
     total = LATE.dynamics.low_frequency_delay
     known = replace(LATE, covariance=calibration(LATE.dynamics, (20e-6) ** 2).covariance)
-    found = sideways_lag(late_scans, known)
+    found = reversal(late_scans, known)
     assert found.lag_of_z == total
     assert found.latency is True
 
@@ -96,17 +96,17 @@ def test_a_poorly_known_delay_of_the_calibration_limits_the_estimate(
     late_scans: list[ScanColumns],
 ) -> None:
     vague = replace(LATE, covariance=calibration(LATE.dynamics, (50e-6) ** 2).covariance)
-    assert sideways_lag(late_scans, vague).uncertainty == pytest.approx(50e-6, rel=1e-3)
+    assert reversal(late_scans, vague).uncertainty == pytest.approx(50e-6, rel=1e-3)
 
 
 def test_scans_in_one_direction_are_refused(late_scans: list[ScanColumns]) -> None:
     with pytest.raises(DataError, match="turn the same way"):
-        sideways_lag([late_scans[0], late_scans[0]], LATE)
+        reversal([late_scans[0], late_scans[0]], LATE)
 
 
 def test_a_single_scan_is_refused(late_scans: list[ScanColumns]) -> None:
     with pytest.raises(DataError, match="1 scan"):
-        sideways_lag(late_scans[:1], LATE)
+        reversal(late_scans[:1], LATE)
 
 
 def test_a_short_scan_is_refused() -> None:
@@ -118,4 +118,4 @@ def test_a_short_scan_is_refused() -> None:
 def test_a_surface_of_revolution_is_refused(surface: Surface) -> None:
     pair = [scan(s, 1, LATE, LATE_CELL, surface) for s in (30.0, -30.0)]
     with pytest.raises(DataError, match="not symmetric about the spindle"):
-        sideways_lag(pair, LATE)
+        reversal(pair, LATE)

@@ -1,4 +1,4 @@
-"""What errors that shift points sideways do to a cloud whose nominal surface nobody gave.
+"""What errors that shift points laterally do to a cloud whose nominal surface nobody gave.
 
 They cost height by the slope of the surface. While the points pass it is not known; once they have
 passed, it is that of a polynomial through them, and the cloud is gone through once more.
@@ -27,7 +27,7 @@ NOT_IN_POINTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Sideways:
+class LateralErrors:
     """heights: rms of what each such source does [m];  largest: uncertainty of a point now [m]
 
     points: evenly chosen, as they are in the cloud now;  warnings: what could not be had
@@ -39,10 +39,10 @@ class Sideways:
     warnings: tuple[str, ...] = ()
 
 
-def add_sideways(
+def add_lateral_errors(
     cloud: Path, options: CorrectionOptions, trace: ScanTrace, most: int
-) -> Sideways | None:
-    """Add to the uncertainty of each point of ``cloud`` what shifts it sideways.
+) -> LateralErrors | None:
+    """Add to the uncertainty of each point of ``cloud`` what shifts it laterally.
 
     most: points to return. Return None where there is no such source, or its slope was known while
     the points passed.
@@ -53,7 +53,7 @@ def add_sideways(
     points = trace.points()
     if not resolves_turns(points):
         names = ", ".join(dict.fromkeys(source.name for source in sources))
-        return Sideways({}, 0.0, np.empty(0), (NOT_IN_POINTS.format(names=names),))
+        return LateralErrors({}, 0.0, np.empty(0), (NOT_IN_POINTS.format(names=names),))
     by_source = standard_fields(sources, points.with_slopes(None))
     fields = scan_fields(by_source, trace.every)
     kept, largest = EvenSelection(most), 0.0
@@ -61,7 +61,7 @@ def add_sideways(
         kept.add(rows)
         largest = max(largest, float(rows["uncertainty"].max()))
     heights = {name: float(np.sqrt(np.mean(np.sum(f**2, axis=0)))) for name, f in by_source.items()}
-    return Sideways(heights, largest, kept.rows())
+    return LateralErrors(heights, largest, kept.rows())
 
 
 def _variance(fields: ScanFields, first: int, count: int) -> FloatArray:

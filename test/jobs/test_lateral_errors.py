@@ -11,7 +11,7 @@ from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.jobs.correct_bag import correct_bag
 from omsm_ros.jobs.judge_scan import live_light, with_sources
-from omsm_ros.jobs.sideways_errors import add_sideways
+from omsm_ros.jobs.lateral_errors import add_lateral_errors
 from omsm_ros.storage.cloud_file import CloudFile
 
 from .test_corrected_scan import write
@@ -73,7 +73,7 @@ def test_points_too_far_apart_for_the_turns_say_so(tmp_path, small_scan, true_ca
         np.zeros((2, len(points))),
         np.zeros(len(points)),
     )
-    found = add_sideways(tmp_path / "none.ply", options, trace, 10)
+    found = add_lateral_errors(tmp_path / "none.ply", options, trace, 10)
     assert found is not None
     assert not found.heights
     assert "centre_x" in found.warnings[0]
