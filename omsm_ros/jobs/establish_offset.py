@@ -75,7 +75,7 @@ def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) 
 
 def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -> FloatArray:
     """Values by count from ``first`` on (n,), NaN where there is none."""
-    length = max(b.first_sample + len(b) for b in blocks) - first
+    length = max(b.end for b in blocks) - first
     if not 0 < length <= _MOST_SAMPLES:
         raise DataError(
             f"counters of axes and distance span {length} samples, expected 1 to {_MOST_SAMPLES}: "

@@ -110,7 +110,7 @@ class PathStart:
             return None
         run = max(self._runs, key=lambda run: sum(map(len, run)))
         z, x, c = (np.concatenate([getattr(b, name) for b in run])[: self._most] for name in "zxc")
-        first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
+        first, end = run[0].first_sample, run[-1].end
         within = [readings for at, readings in self._readings if first <= at < end]
         distance = np.concatenate(within)[: self._most] if within else None
         return ScanPath(z=z, sample_period=run[0].sample_period, x=x, c=c, distance=distance)
@@ -118,7 +118,7 @@ class PathStart:
 
 def _continues(last: AxisBlock, block: AxisBlock) -> bool:
     same_period = abs(block.sample_period / last.sample_period - 1) < SAME_PERIOD
-    return same_period and block.first_sample == last.first_sample + len(last)
+    return same_period and block.first_sample == last.end
 
 
 @dataclass(frozen=True, slots=True)

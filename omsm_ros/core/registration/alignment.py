@@ -101,7 +101,7 @@ class SphereScanReader:
         self._kept.add(np.stack([getattr(scan, name) for name in _COLUMNS], axis=1))
         self.points += len(points)
         last = points.sample[-1]
-        self._axes = [b for b in self._axes if b.first_sample + len(b) > last]
+        self._axes = [b for b in self._axes if b.end > last]
 
     def scan(self) -> SphereScan:
         """The points kept."""

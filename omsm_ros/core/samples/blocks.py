@@ -79,6 +79,11 @@ class Block:
         """Samples in the block."""
         raise NotImplementedError
 
+    @property
+    def end(self) -> int:
+        """Trigger counter after the last sample."""
+        return self.first_sample + len(self)
+
     def _check(
         self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
     ) -> None:

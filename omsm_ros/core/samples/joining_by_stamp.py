@@ -18,6 +18,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
+from omsm_ros.core.samples.merging import uninterrupted
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -175,12 +176,6 @@ def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], Clock]]:
     """Return uninterrupted runs of blocks, each with the clock of its session."""
     runs: list[tuple[list[AxisBlock], Clock]] = []
     for session in _sessions(blocks):
-        clock, run = fit_clock(session), session[:1]
-        for block in session[1:]:
-            if block.first_sample == run[-1].first_sample + len(run[-1]):
-                run.append(block)
-            else:
-                runs.append((run, clock))
-                run = [block]
-        runs.append((run, clock))
+        clock = fit_clock(session)
+        runs += [(run, clock) for run in uninterrupted(session)]
     return runs

@@ -21,8 +21,19 @@ _STAMP_TOLERANCE_S = 1e-3
 _NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
 
 
+def uninterrupted(blocks: Sequence[B]) -> list[list[B]]:
+    """Return the blocks in runs, the count of each block following on that of the one before."""
+    runs: list[list[B]] = []
+    for block in blocks:
+        if runs and block.first_sample == runs[-1][-1].end:
+            runs[-1].append(block)
+        else:
+            runs.append([block])
+    return runs
+
+
 def consecutive(blocks: Sequence[B]) -> list[list[B]]:
-    """Return the blocks in their order, those in one list that can be joined.
+    """Return the blocks in their order, those in one list that :func:`joined` can make one.
 
     They have consecutive counts, one period, the same channels, and stamps that continue the
     first one's.

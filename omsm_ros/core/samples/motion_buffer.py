@@ -59,6 +59,5 @@ class BlockBuffer(Generic[B]):
         if not self._blocks or duration == 0:
             return list(self._blocks)
         last = self._blocks[-1]
-        end = last.first_sample + len(last)
-        first = end - duration / last.sample_period
-        return [b for b in self._blocks if b.first_sample + len(b) > first]
+        first = last.end - duration / last.sample_period
+        return [b for b in self._blocks if b.end > first]

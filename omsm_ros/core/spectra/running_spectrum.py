@@ -93,7 +93,7 @@ class RunningSpectrum:
         if block.first_sample != self._next or block.sample_period != self._period:
             self.restarts += self._next >= 0
             self._begin(block)
-        self._next = block.first_sample + len(block)
+        self._next = block.end
         values = np.array([block.x, block.y, block.z], np.float64)
         self.lost += int(np.count_nonzero(~np.isfinite(values).all(axis=0)))
         self._held = np.hstack([self._held, values])

@@ -15,6 +15,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.samples.blocks import AxisBlock, BoolArray, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.samples.merging import uninterrupted
 from omsm_ros.errors import DataError
 
 # One turn a second at 1 kHz; with less a surface cannot be told from anything.
@@ -111,8 +112,8 @@ class ScanReader:
         points = join_points(self._points)
         if not self._axes or not len(points):
             return
-        for run in _runs(self._axes):
-            begin, end = run[0].first_sample, _end(run[-1])
+        for run in uninterrupted(self._axes):
+            begin, end = run[0].first_sample, run[-1].end
             known = (points.sample >= begin + self._half) & (points.sample < end - self._half)
             if known.any():
                 self._keep(run, points, known)
@@ -120,7 +121,7 @@ class ScanReader:
         waits = (points.sample >= end - self._half) & (not last)
         self._points = [points.part(slice(int(np.argmax(waits)), None))] if waits.any() else []
         needed = points.sample[-1] - 2 * self._half
-        self._axes = [b for b in self._axes if _end(b) > needed]
+        self._axes = [b for b in self._axes if b.end > needed]
 
     def _keep(self, run: list[AxisBlock], points: SurfacePoints, known: BoolArray) -> None:
         x, y, z, c = (np.concatenate([getattr(b, n) for b in run]) for n in "xyzc")
@@ -153,18 +154,3 @@ def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:
     reader.add_axes(axes)
     reader.add(points)
     return reader.columns()
-
-
-def _runs(blocks: list[AxisBlock]) -> list[list[AxisBlock]]:
-    """Return the blocks in groups of which each follows the one before."""
-    runs: list[list[AxisBlock]] = []
-    for block in blocks:
-        if runs and block.first_sample == _end(runs[-1][-1]):
-            runs[-1].append(block)
-        else:
-            runs.append([block])
-    return runs
-
-
-def _end(block: AxisBlock) -> int:
-    return block.first_sample + len(block)
