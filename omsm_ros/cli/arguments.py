@@ -33,7 +33,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def number(quantity: Quantity) -> Callable[[str], Any]:
-    """Argument type: a plausible value of ``quantity``."""
+    """Return the argument type: a plausible value of ``quantity``."""
 
     def read(text: str) -> Any:
         try:
@@ -49,7 +49,7 @@ def number(quantity: Quantity) -> Callable[[str], Any]:
 
 
 def json_object(text: str) -> dict[str, object]:
-    """Argument type: a JSON object."""
+    """Return the argument type: a JSON object."""
     try:
         return strict_json.object_of(text, ConfigurationError, shown(text))
     except ConfigurationError as err:

@@ -195,7 +195,7 @@ _PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
 
 
 def _placed(text: str) -> tuple[Path, str, float]:
-    """Argument type: CAL.json@x=0.01, a calibration and its place."""
+    """Return the argument type: CAL.json@x=0.01, a calibration and its place."""
     found = _PLACED.fullmatch(text)
     if found is None:
         raise argparse.ArgumentTypeError(

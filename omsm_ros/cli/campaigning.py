@@ -47,7 +47,7 @@ def _batch(args: argparse.Namespace) -> Facts:
 
 
 def _options(args: argparse.Namespace) -> list[str]:
-    """Of every correction; what the environment says, it reads for itself."""
+    """Return the options of every correction; what the environment says, it reads for itself."""
     if args.catalogue == os.environ.get(ADDRESS, ""):
         return list(args.passed_on)
     return [*args.passed_on, "--catalogue", args.catalogue]
@@ -70,7 +70,7 @@ def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path)
 
 
 def _link(out: Path, entry: Entry) -> str:
-    """The way from the index to a bag's page, if it has one."""
+    """Return the way from the index to a bag's page, if it has one."""
     page = os.path.join(entry.folder, REPORT)
     return quote(page) if (out / page).exists() else ""
 

@@ -34,7 +34,7 @@ class Command:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[Progress]:
-    """A bar on stderr that counts messages or ``unit``; silent for programs and in pipes."""
+    """Show a bar on stderr that counts messages or ``unit``; none for programs and in pipes."""
     if quiet or not sys.stderr.isatty():
         yield no_progress
         return
@@ -51,7 +51,7 @@ def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[P
 
 
 def kept_at(out: Path, verdict: str) -> Path:
-    """Where to write a result: a rejected one never takes the place of a good one."""
+    """Return where to write a result: a rejected one never takes the place of a good one."""
     return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
 
 

@@ -28,7 +28,7 @@ from omsm_ros.storage.surface_file import load_surface
 
 
 def _freedoms(text: str) -> tuple[str, ...]:
-    """Argument type: freedoms of the second measurement against the first."""
+    """Return the argument type: freedoms of the second measurement against the first."""
     if text == "auto":
         return tuple(name for name in FREEDOMS if name != "power")
     try:

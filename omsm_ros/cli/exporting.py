@@ -16,7 +16,7 @@ from omsm_ros.storage.maps.length_units import LengthUnits, units_of
 
 
 def unit(text: str) -> LengthUnits:
-    """Argument type: the unit of a file that does not carry it."""
+    """Return the argument type: the unit of a file that does not carry it."""
     try:
         return units_of(text)
     except FileError as err:

@@ -15,7 +15,7 @@ from omsm_ros.report.measurement.part import dragged, settled
 
 
 def freedoms(text: str) -> tuple[str, ...]:
-    """Argument type: 'auto', or freedoms of a pose."""
+    """Return the argument type: 'auto', or freedoms of a pose."""
     try:
         return parsed_freedoms(text)
     except ConfigurationError as err:
@@ -23,7 +23,7 @@ def freedoms(text: str) -> tuple[str, ...]:
 
 
 def aperture(text: str) -> Aperture:
-    """Argument type: R or R,X,Y [m]."""
+    """Return the argument type: R or R,X,Y [m]."""
     try:
         parts = [
             quantities.LENGTH.checked(float(part), ConfigurationError, name)

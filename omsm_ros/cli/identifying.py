@@ -165,7 +165,7 @@ def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) 
 
 
 def calibration_facts(calibration: Calibration) -> Facts:
-    """What a calibration says in a few words."""
+    """Return what a calibration says in a few words."""
     verdict, reasons = verdict_of(calibration)
     return {
         "id": calibration.id,

@@ -45,7 +45,7 @@ def _history(args: argparse.Namespace) -> Facts:
 
 
 def _plain(machine: dict[str, Any]) -> dict[str, Any]:
-    """Times as text, for JSON."""
+    """Return the times as text, for JSON."""
     for rows in (machine["calibrations"], machine["measurements"]):
         for row in rows:
             for name in ("recorded_at", "added_at"):

@@ -95,13 +95,13 @@ class BlockStreamDevice(StreamDevice):
     # --- what a model fills in
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
-        """Fields of a frame, by the flags in the block's head."""
+        """Return the fields of a frame, by the flags in the block's head."""
         raise NotImplementedError
 
     def _samples_of(
         self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
     ) -> Samples:
-        """Samples (n,) of the frames (n,) of a block, counted from its head: ``counter`` (n,)."""
+        """Return the samples of the frames (n,) of a block, with their ``counter`` (n,)."""
         raise NotImplementedError
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:

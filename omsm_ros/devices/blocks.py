@@ -111,7 +111,7 @@ class BlockCutter:
     def add(
         self, runs: Sequence[Run], arrival_ns: int, *, after_silence: bool = False
     ) -> Iterator[BlockPair]:
-        """Blocks completed by ``runs``, which arrived together at ``arrival_ns``."""
+        """Yield the blocks completed by ``runs``, which arrived together at ``arrival_ns``."""
         for i, run in enumerate(runs):
             if run.restarted or run.first_sample != self._first + self.pending:
                 yield from self.flush()
@@ -139,12 +139,12 @@ class BlockCutter:
             yield from self._take(self._settings.block_size)
 
     def flush(self) -> Iterator[BlockPair]:
-        """The partial block, if any."""
+        """Yield the partial block, if any."""
         if self.pending:
             yield from self._take(self.pending)
 
     def _times(self, run: Run) -> IntArray:
-        """Device time [ns] of each sample: its own, or its count times the period."""
+        """Return the device time [ns] of each sample: its own, or its count times the period."""
         times: IntArray = run.samples["time"]
         if not self._channels.timed:
             counts = run.first_sample + np.arange(len(run.samples))

@@ -85,7 +85,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         return identity
 
     def _set_sample_time(self, port: CommandPort) -> None:
-        """The controller takes the next time it has, and says which."""
+        """Set the next sample time that the controller has, which it reports."""
         wanted = self._wanted.sample_period / MICROSECOND_S
         said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
         found = re.search(r"\$STI\d+,(\d+)\s*OK", said)

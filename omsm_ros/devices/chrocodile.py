@@ -192,7 +192,7 @@ class Chrocodile(StreamDevice):
         """Make the device send what was selected; raises DeviceError."""
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
-        """The answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
+        """Return the answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
         raise NotImplementedError
 
     # --- setting up
@@ -223,7 +223,7 @@ class Chrocodile(StreamDevice):
         self._asked = self._monotonic()
 
     def _try(self, name: str, *arguments: str | float) -> Answer:
-        """The answer to a command that not every model has; an empty one if it is refused."""
+        """Return the answer to a command that not every model has; an empty one if refused."""
         try:
             return self._ask(name, *arguments)
         except RefusedError:
@@ -304,7 +304,7 @@ class Chrocodile(StreamDevice):
             )
 
     def _selected(self) -> bool:
-        """Whether the device still has our selection; one that was restarted has its own."""
+        """Return whether the device still has our selection; one that was restarted has its own."""
         found = self._ask("SODX", QUERY).numbers
         return not found or set(self._selection) <= set(found)
 
@@ -332,7 +332,7 @@ def _version(text: str) -> str:
 
 
 def _value(text: str) -> object:
-    """A number, where the text is one."""
+    """Return a number, where the text is one."""
     try:
         return float(text)
     except ValueError:
@@ -340,7 +340,7 @@ def _value(text: str) -> object:
 
 
 def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bool:
-    """Whether an answer holds the values set, each within a share of itself; more may follow."""
+    """Return whether an answer holds the values set, within a share of each; more may follow."""
     if within == 0:
         return set(wanted) <= set(found)  # in the device's own order
     return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)

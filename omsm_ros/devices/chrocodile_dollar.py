@@ -74,7 +74,7 @@ class ChrocodileDevice(Chrocodile):
         self._ask("STA")
 
     def _layout(self) -> Layout:
-        """As the device describes its telegrams; as the table says where it does not."""
+        """Return the layout that the device describes, or the table's where it does not."""
         answer = self._ask("DTF")
         try:
             layout = Layout.described(answer.text, self._wanted.sync)
@@ -130,7 +130,7 @@ class ChrocodileDevice(Chrocodile):
         return samples
 
     def _unwrap(self, raw: IntArray) -> IntArray:
-        """Device time [ns] that does not wrap: whole turns of a silence by the host's clock."""
+        """Return device time [ns] that does not wrap; turns in a silence by the host's clock."""
         now = self._monotonic()
         previous = self._raw_time if self._raw_time is not None else int(raw[0])
         steps = np.diff(raw, prepend=previous) % _TIME_RANGE

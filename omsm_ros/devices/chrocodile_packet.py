@@ -112,7 +112,7 @@ class ChrocodilePacketDevice(Chrocodile):
                 raise self._unanswered(what, b"" if understood else self._said)
 
     def _receive(self, data: bytes) -> list[Data]:
-        """Samples in ``data``; commands are kept apart."""
+        """Return the samples in ``data``; commands are kept apart."""
         found = []
         for message in self._decoder.feed(data):
             if isinstance(message, Command):

@@ -68,9 +68,9 @@ class DeviceClock:
         return self._slope if self._span >= _TELLING_S else None
 
     def observe(self, device_ns: int, arrival_ns: int) -> None:
-        """A sample taken at ``device_ns`` was at the host at ``arrival_ns``.
+        """Note that a sample taken at ``device_ns`` was at the host at ``arrival_ns``.
 
-        Of samples that arrive together, the last tells most and is enough.
+        Of samples that arrive together, the last says most and is enough.
         """
         if not self._bins:
             self._origin = (device_ns, arrival_ns)
@@ -87,7 +87,7 @@ class DeviceClock:
             self._fitted_at = device
 
     def to_host(self, device_ns: int) -> int:
-        """Host time [ns] of ``device_ns``, later than every stamp given before.
+        """Return the host time [ns] of ``device_ns``, later than every stamp given before.
 
         A time that no sample can have which arrived with the newest is not believed.
         """
@@ -116,7 +116,7 @@ class DeviceClock:
             self._bins.popleft()
 
     def _stepped(self, device: float, late: float) -> bool:
-        """Whether arrivals have been off the line, to one side, for too long or too far."""
+        """Return whether arrivals have been off the line, to one side, for too long or too far."""
         off = late - (self._offset + self._slope * device)
         if self._bins and not -_EARLY_S < off < _OLDEST_S:
             return True
@@ -131,7 +131,7 @@ class DeviceClock:
         return min(device - since, arrival - arrived) > _STEP_AFTER_S
 
     def _fit(self) -> None:
-        """Huber's line through the bins, the drift held by what crystals do."""
+        """Fit Huber's line through the bins, the drift held by what crystals do."""
         bins = np.array(self._bins)
         count = bins[:, 2]
         device, late = bins[:, 0] / count, bins[:, 1] / count
@@ -152,7 +152,7 @@ def _arrival(item: tuple[float, float, int]) -> float:
 def _line(
     x: FloatArray, y: FloatArray, count: FloatArray, sigma: float
 ) -> tuple[float, float, float]:
-    """Offset, slope and its uncertainty of a robust line; sigma: of the slope beforehand."""
+    """Return offset, slope and its uncertainty of a robust line; sigma: of the slope beforehand."""
     offset, slope = float(np.median(y)), 0.0
     weight, scale = count, _LEAST_SCALE_S
     uncertainty = np.inf

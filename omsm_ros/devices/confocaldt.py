@@ -267,6 +267,6 @@ def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
 
 
 def _info(said: str) -> dict[str, str]:
-    """``Name: value`` lines of an answer."""
+    """Return the ``Name: value`` lines of an answer."""
     pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", said)
     return {key.strip().lower(): value.strip() for key, value in pairs}

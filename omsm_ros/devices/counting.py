@@ -83,13 +83,13 @@ class SequenceTracker:
         return len(self._held)
 
     def begin_anew(self) -> None:
-        """The device is known to have been restarted: its next number counts from there."""
+        """Count from the device's next number, for it is known to have been restarted."""
         self._anew = self._begun
 
     def split(
         self, samples: Samples, elapsed: float = 0.0, *, broken: bool = False
     ) -> Iterator[Run]:
-        """Runs of ``samples`` (n,), in order.
+        """Yield the runs of ``samples`` (n,), in order.
 
         elapsed: how long nothing had come before [s];  broken: that was a silence, or the line
         was down
@@ -109,13 +109,13 @@ class SequenceTracker:
             samples = samples[count:]
 
     def settle(self) -> Iterator[Run]:
-        """The sample held back, when nothing came after it."""
+        """Yield the sample held back, when nothing came after it."""
         held, self._held = self._held, np.empty(0, SAMPLE)
         if len(held):
             yield from self._one(held, _Break())
 
     def _in_order(self, samples: Samples) -> int:
-        """How many samples at the beginning just go on."""
+        """Return how many samples at the beginning just go on."""
         if not self._begun:
             return 0
         steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
@@ -132,7 +132,7 @@ class SequenceTracker:
         return Run(samples, first, restarted)
 
     def _waits(self, samples: Samples) -> bool:
-        """Whether the only sample left leaps, and the next must tell whether it is spoilt."""
+        """Return whether the only sample left leaps, so that the next one has to decide."""
         return len(samples) == 1 and self._leaps(samples[0])
 
     def _leaps(self, sample: np.void) -> bool:
@@ -141,7 +141,7 @@ class SequenceTracker:
         return self._step(int(sample["counter"])) > 1 and not self._sent_before(sample)
 
     def _spoilt(self, samples: Samples) -> bool:
-        """Whether the counter leaps at the first sample and is back at the next."""
+        """Return whether the counter leaps at the first sample and is back at the next."""
         if len(samples) < 2 or not self._leaps(samples[0]):
             return False
         here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
@@ -151,7 +151,7 @@ class SequenceTracker:
         return (raw - self._raw) % self._counting.modulus
 
     def _one(self, samples: Samples, pause: _Break) -> Iterator[Run]:
-        """What becomes of the first of ``samples``, which does not just go on."""
+        """Yield what becomes of the first of ``samples``, which does not just go on."""
         sample, alone = samples[0], samples[:1]
         raw = int(sample["counter"])
         if not self._begun:
@@ -196,7 +196,7 @@ class SequenceTracker:
         return abs(pause.elapsed - whole * period) > _SLACK_S
 
     def _turns(self, step: int, pause: _Break) -> int:
-        """Whole turns of the counter that a silence hid."""
+        """Return the whole turns of the counter that a silence hid."""
         if not self._counting.period:
             return 0
         hidden = pause.elapsed / self._counting.period - step

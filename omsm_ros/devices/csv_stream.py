@@ -91,5 +91,5 @@ class CsvStreamDevice(StreamDevice):
 
 
 def _in_parts(axis: AxisScaling) -> AxisScaling:
-    """The same axis, counted in parts of a count."""
+    """Return the same axis, counted in parts of a count."""
     return replace(axis, counts_per_unit=axis.counts_per_unit * _PARTS, wrap=axis.wrap * _PARTS)

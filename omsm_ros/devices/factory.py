@@ -145,12 +145,12 @@ AXIS_PARAMETERS = (
 
 
 def defaults(parameters: Sequence[Parameter] = PARAMETERS) -> dict[str, Any]:
-    """Every parameter at its default."""
+    """Return every parameter at its default."""
     return {parameter.name: parameter.default for parameter in parameters}
 
 
 def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """The device that ``values`` describe, not yet connected.
+    """Return the device that ``values`` describe, not yet connected.
 
     values: every name of PARAMETERS. Raises ConfigurationError.
     """
@@ -164,7 +164,7 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
 
 
 def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """The stream of axes that ``values`` describe, not yet connected.
+    """Return the stream of axes that ``values`` describe, not yet connected.
 
     values: every name of AXIS_PARAMETERS. Raises ConfigurationError.
     """
@@ -174,7 +174,7 @@ def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
 
 
 def _axes(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScaling]:
-    """The scaling of every axis; ConfigurationError for one of ``wired`` without a scale."""
+    """Return the scaling of every axis; ConfigurationError for one of ``wired`` without a scale."""
     for axis in wired:
         if values[f"{axis}.counts_per_unit"] == 0:
             raise ConfigurationError(
@@ -196,7 +196,10 @@ def block_settings(values: Values) -> dict[str, Any]:
 
 
 def _stream_settings(values: Values) -> dict[str, Any]:
-    """Of a stream that cannot be asked whether it rests or is gone; a serial line is never half."""
+    """Return settings of a stream that cannot be asked whether it rests or is gone.
+
+    A serial line is never half open.
+    """
     renew = values["renew"] if values["port"].startswith("tcp://") else 0.0
     return block_settings(values) | {"renew": renew}
 
@@ -265,7 +268,7 @@ def _confocaldt_ethernet(values: Values, transport: Transport, now_ns: NowNs) ->
 
 
 def command_transport(address: str, port: int) -> Transport | None:
-    """The port for commands of the device at ``address``; None for port 0."""
+    """Return the port for commands of the device at ``address``; None for port 0."""
     if port == 0:
         return None
     host, colon, _ = address.rpartition(":")

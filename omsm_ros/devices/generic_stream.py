@@ -82,7 +82,7 @@ class GenericStreamDevice(StreamDevice):
 
 
 def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:
-    """Samples (n,) of decoded frames (n,)."""
+    """Return the samples (n,) of decoded frames (n,)."""
     samples = np.zeros(len(frames), SAMPLE)
     samples["counter"] = frames["sequence"]
     samples["time"] = frames["device_time"].astype(np.int64)

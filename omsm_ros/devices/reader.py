@@ -76,7 +76,7 @@ class DeviceReader:
         )
 
     def ask(self, request: Callable[[], None], patience: float) -> None:
-        """Have the reading thread do ``request`` to the device between two reads, and wait for it.
+        """Let the reading thread do ``request`` to the device between two reads, and wait for it.
 
         Raises what ``request`` raises; DeviceError where the device is not being read, or after
         ``patience`` [s].

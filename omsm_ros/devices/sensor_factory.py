@@ -60,7 +60,7 @@ ACCELEROMETER_PARAMETERS = (
 
 
 def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice | AnalogDevice:
-    """The reference sensor that ``values`` describe, not yet connected.
+    """Return the reference sensor that ``values`` describe, not yet connected.
 
     values: every name of REFERENCE_PARAMETERS. Raises ConfigurationError.
     """
@@ -84,7 +84,7 @@ def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice
 
 
 def make_accelerometer(values: Values, now_ns: NowNs = time.time_ns) -> Accelerometer:
-    """The accelerometer that ``values`` describe, not yet sampling.
+    """Return the accelerometer that ``values`` describe, not yet sampling.
 
     values: every name of ACCELEROMETER_PARAMETERS. Raises ConfigurationError.
     """

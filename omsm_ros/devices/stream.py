@@ -91,7 +91,7 @@ class StreamDevice:
         self._opened = self._monotonic()
 
     def poll(self, timeout: float) -> list[BlockPair]:
-        """Blocks completed by what arrives within ``timeout`` [s]; may be none.
+        """Return the blocks completed by what arrives within ``timeout`` [s]; may be none.
 
         Raises DeviceError when the connection or the device is lost; ``close`` then still
         hands over the partial block.
@@ -164,7 +164,7 @@ class StreamDevice:
         )
 
     def counts(self) -> dict[str, float]:
-        """All statistics by name, those of the protocol included."""
+        """Return all statistics by name, those of the protocol included."""
         return asdict(self.statistics)
 
     # --- what a model fills in
@@ -173,15 +173,15 @@ class StreamDevice:
         """Set the device up; raises DeviceError."""
 
     def _decode(self, data: bytes) -> Samples:
-        """Samples that ``data`` completes, shape (n,); n may be 0."""
+        """Return the samples that ``data`` completes, shape (n,); n may be 0."""
         raise NotImplementedError
 
     def _rest(self) -> Samples:
-        """A sample that was complete, but waited for what follows it; shape (n,)."""
+        """Return a sample that was complete, but waited for what follows it; shape (n,)."""
         return np.empty(0, SAMPLE)
 
     def _listen_in(self, silent: float) -> None:
-        """Nothing came for ``silent`` [s]: raise DeviceError if the device is gone."""
+        """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
 
     # --- common
 
@@ -204,7 +204,7 @@ class StreamDevice:
         return list(self._cutter.add(runs, arrival_ns, after_silence=after_silence))
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
-        """Everything that waited, now that nothing follows."""
+        """Return everything that waited, now that nothing follows."""
         rest = self._rest()
         blocks = self._add(rest, arrival_ns, 0.0) if len(rest) else []
         blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)

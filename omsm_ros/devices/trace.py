@@ -93,7 +93,7 @@ class Event:
 
 
 def read_trace(path: Path) -> list[Event]:
-    """Events of a trace; ConfigurationError if it is none."""
+    """Return the events of a trace; ConfigurationError if it is none."""
     events = []
     for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), start=1):
         try:
@@ -119,11 +119,11 @@ class ReplayTransport:
         self._time = 0.0
 
     def now(self) -> float:
-        """Seconds since the trace began."""
+        """Return the seconds since the trace began."""
         return self._time
 
     def now_ns(self) -> int:
-        """Nanoseconds since the trace began."""
+        """Return the nanoseconds since the trace began."""
         return round(self._time * NANOSECONDS_PER_S)
 
     @property

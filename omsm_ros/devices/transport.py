@@ -42,7 +42,7 @@ class Transport(Protocol):
         """Connect; raises DeviceError."""
 
     def read(self, timeout: float) -> bytes:
-        """What has arrived, waiting up to ``timeout`` [s] for the first byte; b"" if none came.
+        """Return what has arrived, waiting up to ``timeout`` [s] for a first byte; else b"".
 
         Raises DeviceError when the connection is lost.
         """
@@ -181,7 +181,7 @@ class TcpTransport:
 
 
 def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport:
-    """The transport that ``address`` names.
+    """Return the transport that ``address`` names.
 
     ``tcp://host:port``; ``ads://host?symbol=GVL.omsm`` of a TwinCAT PLC;
     ``serial:///dev/ttyUSB0?baud=921600`` or the path of a serial port

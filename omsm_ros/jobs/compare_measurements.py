@@ -93,7 +93,7 @@ def measurement_at(path: Path, ways: Ways, nominal: Surface | None) -> Measureme
 
 
 def _calibration_of(path: Path) -> str:
-    """What a result folder of ours was corrected by; empty if that is not known."""
+    """Return what a result folder of ours was corrected by; empty if that is not known."""
     summary = path / SUMMARY
     if not summary.is_file():
         return ""
@@ -103,7 +103,7 @@ def _calibration_of(path: Path) -> str:
 
 
 def _fields_beside(path: Path, points: MeasuredPoints) -> ScanFields | None:
-    """What the systematic errors of a scan of ours do to its points, if they are stored."""
+    """Return what the systematic errors of a scan of ours do to its points, if they are stored."""
     folder = path if path.is_dir() else path.parent
     if path.is_file() and path.name != "cloud.ply":
         return None

@@ -72,7 +72,7 @@ def _along(path: ToolPath, out: Path) -> dict[str, Any]:
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:
-    """What speaks against the cut."""
+    """Return what speaks against the cut."""
     found = []
     if sure < _LEAST_SURE:
         found.append(

@@ -126,7 +126,7 @@ class _Findings:
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
-        """What counters and stamps say; those of axes that were joined by stamps are not theirs."""
+        """Return what counters and stamps say against the scan; not of axes joined by stamps."""
         found = [*self._distance.faults("distance")]
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)

@@ -183,7 +183,7 @@ class CorrectedScan:
 
 
 def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock | DistanceBlock]:
-    """The axes at the probe's samples, and the probe's blocks, as if one trigger had both.
+    """Yield the axes at the probe's samples, and the probe's blocks, as if one trigger had both.
 
     A block that repeats samples or comes late has no axes; it is counted as what it is.
     """

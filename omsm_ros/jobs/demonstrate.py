@@ -118,7 +118,7 @@ class Demonstration:
         return round(spiral_of(self.scenario).duration / self.sample_period)
 
     def emulator_parameters(self) -> dict[str, object]:
-        """ROS parameters of the emulator."""
+        """Return ROS parameters of the emulator."""
         return {
             "device": self.device,
             "time_lapse": self.time_lapse,
@@ -129,12 +129,12 @@ class Demonstration:
         }
 
     def driver_parameters(self) -> dict[str, object]:
-        """ROS parameters of the driver."""
+        """Return ROS parameters of the driver."""
         fixed = {"device": self.device, "port": self.link, "sample_period": self.sample_period}
         return fixed | emulated(self.device).driver
 
     def settings(self) -> dict[str, object]:
-        """What the calibration will belong to."""
+        """Return what the calibration will belong to."""
         return {
             "machine": "digital twin of the paper's cell",
             "fixture": "twin",
@@ -216,7 +216,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
 
 
 def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
-    """Entries of the summary that only the twin's truth can give; lengths in metres."""
+    """Return the entries of the summary that only the twin's truth can give; lengths in metres."""
     truth: TruthComparison = departure_from_truth(
         recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
     )
@@ -228,14 +228,14 @@ def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, An
 
 
 def true_response(recording: Recording) -> TrueResponse:
-    """What an identification should have found."""
+    """Return what an identification should have found."""
     if recording.truth is None:
         raise OmsmError("this recording comes without the truth behind it; record it on the twin")
     return recording.truth.response
 
 
 def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[str, float]]:
-    """Identified against true response: relative gain error [1], phase error [deg]."""
+    """Compare the identified with the true response: relative gain error [1], phase error [deg]."""
     frequency = np.array(RESPONSE_FREQUENCIES_HZ)
     ratio = calibration.dynamics.response(frequency) / true.response(frequency)
     gain, phase = np.abs(ratio) - 1, np.angle(ratio, deg=True)
@@ -246,28 +246,28 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
 
 
 def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
-    """One wide picture: map before in µm, after in nm, identified and true response."""
+    """Return one wide picture: map before in µm, after in nm, identified and true response."""
     raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
     figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
     return style.png(figure, dpi=120)
 
 
 def live_points(bag: Path) -> NDArray[np.void]:
-    """All points the corrector node published while ``bag`` was recorded, in order."""
+    """Return all points the corrector node published while ``bag`` was recorded, in order."""
     with bags.BagReader(bag) as reader:
         clouds = [points for _, points in reader.records(bags.POINTS_TOPIC)]
     return np.concatenate(clouds) if clouds else np.empty(0, np.dtype(list(CLOUD_FIELDS)))
 
 
 def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
-    """True if every field of every point is the same to the last bit."""
+    """Return True if every field of every point is the same to the last bit."""
     return len(live) == len(stored) and all(
         live[name].tobytes() == stored[name].tobytes() for name, _ in CLOUD_FIELDS
     )
 
 
 def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
-    """Bode plot against the truth, and what the model makes of the step test."""
+    """Return Bode plot against the truth, and what the model makes of the step test."""
     axes, period = step.axes, calibration.sample_period
     recursion = Recursion(discretise(calibration.dynamics, period))
     recursion.start(past_motion(axes.z[:_REST_SAMPLES]))
@@ -285,7 +285,7 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
-    """The result for the terminal."""
+    """Return the result for the terminal."""
     rows = [*_sample_rows(summary), *_accuracy_rows(summary)]
     width = max(len(name) for name, _ in rows)
     body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)

@@ -61,7 +61,7 @@ def established_offset(
 
 
 def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) -> int:
-    """The offset by the stamps alone [samples]."""
+    """Return the offset by the stamps alone [samples]."""
     starts = np.array([(b.stamp_ns, b.first_sample) for b in axes], np.int64)
     near = [int(np.argmin(abs(starts[:, 0] - b.stamp_ns))) for b in distance]
     apart = [
@@ -74,7 +74,7 @@ def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) 
 
 
 def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -> FloatArray:
-    """Values by count from ``first`` on (n,), NaN where there is none."""
+    """Return the values by count from ``first`` on (n,), NaN where there is none."""
     length = max(b.end for b in blocks) - first
     if not 0 < length <= _MOST_SAMPLES:
         raise DataError(

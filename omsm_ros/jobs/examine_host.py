@@ -90,7 +90,7 @@ def _packages() -> Iterator[Check]:
 
 
 def _ros(environment: os._Environ[str]) -> Iterator[Check]:
-    """Whether nodes can start, and whether they find each other."""
+    """Yield whether nodes can start, and whether they find each other."""
     if importlib.util.find_spec("rclpy") is None:
         yield Check(
             "ROS 2", DOUBTFUL, "not found: the offline commands work, nodes do not",
@@ -115,7 +115,7 @@ def _ros(environment: os._Environ[str]) -> Iterator[Check]:
 
 
 def _discovery() -> Check:
-    """Whether two processes' worth of ROS find each other and pass a message."""
+    """Return whether two processes' worth of ROS find each other and pass a message."""
     command = [sys.executable, "-m", "omsm_ros.nodes.discovery_check"]
     try:
         done = subprocess.run(
@@ -147,7 +147,7 @@ def _serial(port: str) -> Check:
 
 
 def _clock(synchronised: Callable[[], bool | None]) -> Check:
-    """Whether stamps of this computer can be compared with those of another."""
+    """Return whether stamps of this computer can be compared with those of another."""
     remedy = "sudo timedatectl set-ntp true, where stamps of several computers are compared"
     states = {
         True: Check("clock", FINE, "synchronised"),
@@ -158,7 +158,7 @@ def _clock(synchronised: Callable[[], bool | None]) -> Check:
 
 
 def _kernel_clock_synchronised() -> bool | None:
-    """What systemd says of the clock; None where it says nothing."""
+    """Return what systemd says of the clock; None where it says nothing."""
     try:
         done = subprocess.run(
             ["timedatectl", "show", "--property=NTPSynchronized", "--value"],

@@ -53,7 +53,7 @@ def export(
 
 
 def _table(source: Path, units: LengthUnits | None) -> NDArray[np.void]:
-    """All columns of a cloud of ours; of another file those that every format has."""
+    """Return all columns of a cloud of ours; of another file those that every format has."""
     file = source / CLOUD if source.is_dir() else source
     try:
         cloud = CloudFile(file)

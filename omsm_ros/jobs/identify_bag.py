@@ -26,7 +26,7 @@ def motion_of_bag(
     trigger: CommonTrigger = EQUAL_COUNTS,
     progress: Progress = no_progress,
 ) -> MotionRecord:
-    """The motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
+    """Return the motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
 
     time_lapse: how much faster than real time the recording was played [1]
     trigger: what is stated of the counters of axes and distance
@@ -49,7 +49,7 @@ def motion_of_bag(
 
 
 def settings_of_bag(path: AnyBag, stated: Mapping[str, object]) -> dict[str, object]:
-    """What a calibration from this bag belongs to: as ``stated``, and as the probe told there."""
+    """Return what a calibration from this bag belongs to: ``stated``, and the probe's report."""
     with bags.BagReader(path) as bag:
         return settings_with(stated, bag.probe_settings())
 

@@ -101,7 +101,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
 
 
 def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
-    """Every channel of the map comes from files of one kind, and each stream is whole."""
+    """Raise DataError unless each stream is whole and comes from files of one kind."""
     for channel in mapped.columns:
         if not mapped.has(channel) or channel in COUNTING:
             continue
@@ -175,7 +175,7 @@ class _Source:
             )
 
     def _check_units(self) -> None:
-        """What the file itself says of a unit is not overruled in silence."""
+        """Raise DataError where the map contradicts what the file itself says of a unit."""
         for channel in self.channels:
             column = self._mapped.columns[channel]
             stated = stated_unit(self._table, column.name)
@@ -207,7 +207,7 @@ class _Source:
         found.passed_over = self._table.passed_over
 
     def _number(self, rows: Rows) -> int:
-        """Trigger number before those of ``rows``."""
+        """Return the trigger number before those of ``rows``."""
         return int(rows.counter[0]) - 1 if self._last is None else self._last
 
     def _made(

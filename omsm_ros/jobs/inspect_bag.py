@@ -39,7 +39,7 @@ class Inspection:
     faults: list[str] = field(default_factory=list)
 
     def entry(self) -> dict[str, object]:
-        """JSON values."""
+        """Return the JSON values of this record."""
         return {"topics": [asdict(stream) for stream in self.streams], "faults": self.faults}
 
 

@@ -87,7 +87,7 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
 
 
 def _advice(form: Form) -> list[str]:
-    """What would say more, where a move leaves less of the form than it is sure of."""
+    """Return what would say more, where a move leaves less of the form than it is sure of."""
     freedoms, rms = form.registration.freedoms, form.deviation["rms"]
     fitted = [n for n in freedoms.fitted if n in MOVES]
     if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:

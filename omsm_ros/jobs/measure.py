@@ -133,7 +133,7 @@ def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Reg
 def summarise(
     bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
 ) -> dict[str, Any]:
-    """What ``summary.json`` says of every measurement; lengths in metres."""
+    """Return what ``summary.json`` says of every measurement; lengths in metres."""
     summary: dict[str, Any] = {
         "schema": "omsm-summary/1",
         "bag": str(bag),
@@ -163,7 +163,7 @@ def summarise(
 
 
 def _places(calibration: Calibration) -> dict[str, Any]:
-    """Where the members of a calibration set were made."""
+    """Return where the members of a calibration set were made."""
     if not isinstance(calibration, CalibrationSet):
         return {}
     places = {"along": calibration.along, "positions": list(calibration.positions)}
@@ -171,7 +171,7 @@ def _places(calibration: Calibration) -> dict[str, Any]:
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:
-    """Was the scan slow enough to be trusted, and how good was H on its motion?"""
+    """Return whether the scan was slow enough to be trusted, and how good H was on its motion."""
     try:
         prediction = predict_error(calibration, done.path)
         digital = discretise(calibration.dynamics, done.sample_period)

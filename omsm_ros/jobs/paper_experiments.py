@@ -116,7 +116,7 @@ def _chirp(out: Path, seed: int) -> _Done:
 
 
 def circle_scan(name: str, seed: int) -> Recording:
-    """One of F1 to F4 over marks of 15 µm; from F3 on the machine shakes at 680 Hz."""
+    """Return one of F1 to F4 over marks of 15 µm; from F3 on the machine shakes at 680 Hz."""
     rpm = TABLE_1[name][0]
     shaking = VibrationLine(amplitude_m=SHAKING_M, frequency_hz=SHAKING_HZ)
     errors = Disturbances(

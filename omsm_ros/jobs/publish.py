@@ -33,13 +33,13 @@ def figures_of(
     nominal: Surface | None,
     sample_period: float,
 ) -> dict[str, bytes]:
-    """PNG files for the page of a cloud whose truth nobody knows."""
+    """Return PNG files for the page of a cloud whose truth nobody knows."""
     figures = surface_figures(view, nominal) if view is not None else {}
     return figures | {"bode": style.png(bode(calibration, None, sample_period))}
 
 
 def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
-    """Columns of a cloud for the figures; None if it has no points.
+    """Return the columns of a cloud for the figures; None if it has no points.
 
     Without the dynamic correction its height would be ``raw_height``.
     """
@@ -59,7 +59,7 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
 
 
 def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
-    """The map that a reader can enlarge; of the registered deviation if ``out`` has one."""
+    """Return the map that a reader can enlarge; of the registered deviation if ``out`` has one."""
     if view is None:
         return None
     layers = []
@@ -99,7 +99,7 @@ def publish(
 
 
 def _form_in(out: Path) -> dict[str, Any]:
-    """The content of ``form.json`` in ``out``; empty where the part was not registered."""
+    """Return the content of ``form.json`` in ``out``; empty where the part was not registered."""
     if not (out / FORM).is_file():
         return {}
     text = read_text(out / FORM, _MAX_FORM_BYTES, FileError, "form")

@@ -24,7 +24,7 @@ def no_progress(done: int, total: int) -> None:
 def read_blocks(
     path: AnyBag, topics: Sequence[str], progress: Progress = no_progress
 ) -> dict[str, list[Block]]:
-    """All blocks on ``topics``, by topic; BagError if one of the topics is not there."""
+    """Return all blocks on ``topics``, by topic; BagError if one of the topics is not there."""
     found: dict[str, list[Block]] = {topic: [] for topic in topics}
     with bags.BagReader(path) as bag:
         total = bag.count(topics)

@@ -82,7 +82,7 @@ class _Followed:
         return self.fields.names
 
     def at(self, first: int, count: int) -> FloatArray:
-        """Fields (s, count) [m] of the kept points from ``first`` on."""
+        """Return the fields (s, count) [m] of the kept points from ``first`` on."""
         chosen = self.kept[first : first + count]
         low = int(chosen[0]) if len(chosen) else 0
         rows = self.fields.at(low, int(chosen[-1]) - low + 1 if len(chosen) else 0)
@@ -102,7 +102,7 @@ class _OfPose:
         return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
 
     def at(self, first: int, count: int) -> FloatArray:
-        """Fields (p, count) [m] of the kept points from ``first`` on."""
+        """Return the fields (p, count) [m] of the kept points from ``first`` on."""
         part = _slice(self.at_, first, count)
         none = np.zeros((self.found.moved.shape[1] - 2 * len(self.found.held_effects), len(part.x)))
         pose, sources = self.found.effects(part, none)

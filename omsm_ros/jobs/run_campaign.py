@@ -218,7 +218,7 @@ def _task(
 
 
 def _is_done(entry: Entry | None, task: Task, out: Path) -> bool:
-    """Whether a result of this very task is there. What was refused or crashed is tried again."""
+    """Return whether a result of this very task is there; what failed is tried again."""
     return (
         entry is not None
         and entry.state == DONE
@@ -245,7 +245,7 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Two campaigns never write into one folder."""
+    """Hold the folder, so that two campaigns never write into it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)

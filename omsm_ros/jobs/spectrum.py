@@ -115,7 +115,7 @@ def spectra_of(
 
 
 def _names(paths: Sequence[AnyBag]) -> list[str]:
-    """Of the files, told apart by a number where two have the same."""
+    """Return the names of the files, with a number where two have the same."""
     stems = [Path(str(path)).stem for path in paths]
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
@@ -237,7 +237,7 @@ def _scan_facts(scan: SpectrumOfScan, options: SpectrumOptions) -> dict[str, Any
 
 
 def _motion_facts(motion: Density, calibration: Calibration | None) -> dict[str, Any]:
-    """The path's own spectrum, and the part of its power that the calibration knows nothing of."""
+    """Return the path's own spectrum, and the share of its power beyond the calibrated band."""
     top = float(motion.frequency[-1])
     total = motion.power(0.0, top)
     if calibration is None:

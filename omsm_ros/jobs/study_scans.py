@@ -72,7 +72,7 @@ def self_calibration_of(
     options: SelfCalibrationOptions,
     progress: Progress = no_progress,
 ) -> tuple[SelfCalibration, Calibration, list[Account]]:
-    """What scans of one part tell of the dynamics, and a calibration from it.
+    """Return what scans of one part say of the dynamics, and a calibration from it.
 
     step_test: from the same machine; None takes the scans alone
     Also return where every sample of each scan has gone.
@@ -124,7 +124,7 @@ def alignment_of(
     geometry: Geometry,
     progress: Progress = no_progress,
 ) -> tuple[Alignment, Account]:
-    """Spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m].
+    """Find spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m].
 
     Also return where every sample of the scan has gone.
     """

@@ -22,7 +22,7 @@ def path_check_of(
     progress: Progress = no_progress,
     trigger: CommonTrigger = EQUAL_COUNTS,
 ) -> PathCheck:
-    """The paper's Fig. 9: errors and phase lags of a free path on a fixed target.
+    """Return the paper's Fig. 9: errors and phase lags of a free path on a fixed target.
 
     trigger: what is stated of the counters of axes and distance
     """
@@ -38,6 +38,6 @@ def path_check_of(
 
 
 def _bridged(record: MotionRecord) -> FloatArray:
-    """Distance with its dropouts bridged by straight lines: the Hilbert transform needs no gaps."""
+    """Return the distance, dropouts bridged by lines: a Hilbert transform has no use for gaps."""
     index = np.arange(len(record))
     return np.interp(index, index[record.ok], record.distance[record.ok])

@@ -46,7 +46,7 @@ class AccelerometerDriverNode(DriverNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros accelerometer_driver``."""
+    """Run ``ros2 run omsm_ros accelerometer_driver``."""
     run(AccelerometerDriverNode)
 
 

@@ -15,7 +15,7 @@ class AxisDriverNode(DriverNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros axis_driver``."""
+    """Run ``ros2 run omsm_ros axis_driver``."""
     run(AxisDriverNode)
 
 

@@ -92,7 +92,7 @@ class CalibrationTopic:
             self.refused = refused
 
     def _plausible(self, stamp_ns: int) -> int:
-        """Of a message without a stamp, or from a clock that is ahead: now."""
+        """Return the stamp; now, of a message without one, or from a clock that is ahead."""
         now = self._now_ns()
         return stamp_ns if 0 < stamp_ns < now + _AHEAD_NS else max(now, self.since_ns + 1)
 

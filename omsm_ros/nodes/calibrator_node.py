@@ -256,7 +256,7 @@ class CalibratorNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros calibrator``."""
+    """Run ``ros2 run omsm_ros calibrator``."""
     run(CalibratorNode)
 
 

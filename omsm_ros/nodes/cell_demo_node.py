@@ -53,11 +53,11 @@ class DemoNode(Node):
             }
 
     def value(self, node: str, key: str) -> int:
-        """A count from a node's diagnostics; 0 before the first one."""
+        """Return a count from a node's diagnostics; 0 before the first one."""
         return int(self._status.get(node, {}).get(key, 0))
 
     def text(self, node: str, key: str) -> str:
-        """A text from a node's diagnostics; empty before the first one."""
+        """Return a text from a node's diagnostics; empty before the first one."""
         return self._status.get(node, {}).get(key, "")
 
     def wait_until(
@@ -224,7 +224,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros cell_demo``."""
+    """Run ``ros2 run omsm_ros cell_demo``."""
     args = _arguments()
     # A demonstration talks to its own nodes only, whatever else runs on the network.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -129,7 +129,7 @@ class CellEmulatorNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros cell_emulator``."""
+    """Run ``ros2 run omsm_ros cell_emulator``."""
     run(CellEmulatorNode)
 
 

@@ -49,7 +49,7 @@ class ConfocalDriverNode(DriverNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros confocal_driver``."""
+    """Run ``ros2 run omsm_ros confocal_driver``."""
     run(ConfocalDriverNode)
 
 

@@ -243,7 +243,7 @@ class CorrectorNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros corrector``."""
+    """Run ``ros2 run omsm_ros corrector``."""
     run(CorrectorNode)
 
 

@@ -96,7 +96,7 @@ class Listeners:
         return sorted(n for n, each in self._listeners.items() if any(self._open(each).values()))
 
     def _open(self, listener: _Listener) -> dict[str, int]:
-        """Messages by topic that it has not taken."""
+        """Return the messages by topic that it has not taken."""
         if not listener.taken:
             return {}
         return {

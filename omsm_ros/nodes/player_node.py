@@ -167,7 +167,7 @@ class PlayerNode(ManagedNode):
             self._at_the_end()
 
     def _in_the_way(self) -> str:
-        """Why playing cannot begin yet; empty if it can."""
+        """Return why playing cannot begin yet; empty if it can."""
         for topic, publisher in self._offers.items():
             name = publisher.topic_name
             if topic in _SAMPLES and self.count_publishers(name) > 1:
@@ -251,7 +251,7 @@ class PlayerNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros replay``."""
+    """Run ``ros2 run omsm_ros replay``."""
     run(PlayerNode)
 
 

@@ -50,7 +50,7 @@ class NodeProcesses:
         return self._running[node].pid
 
     def check(self) -> None:
-        """OmsmError with the last words of a node that ended by itself."""
+        """Raise OmsmError with the last words of a node that ended by itself."""
         for name, process in self._running.items():
             if process.poll() is not None:
                 lines = (self._folder / f"{name}.log").read_text(errors="replace").split("\n")

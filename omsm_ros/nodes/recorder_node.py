@@ -144,7 +144,7 @@ class RecorderNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros recorder``; exit code 2 if the disk took no more."""
+    """Run ``ros2 run omsm_ros recorder``; exit code 2 if the disk took no more."""
     run(RecorderNode)
 
 

@@ -17,7 +17,7 @@ class ReferenceDriverNode(DriverNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros reference_driver``."""
+    """Run ``ros2 run omsm_ros reference_driver``."""
     run(ReferenceDriverNode)
 
 

@@ -141,7 +141,7 @@ def _spin(node: ManagedNode, ending: _Ending) -> None:
 
 
 def settings_of(text: str) -> dict[str, object]:
-    """Settings from a parameter that holds a JSON object; ConfigurationError if it does not."""
+    """Return settings from a parameter that holds a JSON object, else ConfigurationError."""
     return strict_json.object_of(text, ConfigurationError, "parameter 'settings'")
 
 

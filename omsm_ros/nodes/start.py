@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def end_with_launch() -> None:
-    """Have SIGTERM sent to this process when the launch that started it ends, however it does.
+    """Let SIGTERM be sent to this process when the launch that started it ends, however it does.
 
     ``ros2 launch`` hands Ctrl-C on; a SIGTERM, as ``docker stop`` sends one, or a SIGKILL ends it
     alone, and its nodes would keep the device and the recording until somebody finds them.

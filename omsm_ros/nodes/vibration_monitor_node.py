@@ -119,7 +119,7 @@ class VibrationMonitorNode(ManagedNode):
 
 
 def _figures(levels: Any) -> dict[str, object]:
-    """Every level by its name, in SI."""
+    """Return every level by its name, in SI."""
     found: dict[str, object] = {"windows": levels.windows}
     for place, (low, high) in enumerate(levels.bands):
         band = f"{low:g}_{high:g}_hz"
@@ -142,7 +142,7 @@ def _edges(text: str) -> tuple[float, ...]:
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros vibration_monitor``."""
+    """Run ``ros2 run omsm_ros vibration_monitor``."""
     run(VibrationMonitorNode)
 
 

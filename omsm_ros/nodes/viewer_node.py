@@ -104,7 +104,7 @@ class ViewerNode(ManagedNode):
 
 
 def main() -> None:
-    """Entry point of ``ros2 run omsm_ros viewer``."""
+    """Run ``ros2 run omsm_ros viewer``."""
     run(ViewerNode)
 
 

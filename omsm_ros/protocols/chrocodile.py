@@ -55,7 +55,7 @@ class RequestParser:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[Request]:
-        """Commands completed by ``data``."""
+        """Return the commands completed by ``data``."""
         *lines, rest = (self._buffer + data).split(b"\r")
         found = [request for line in lines if (request := _request(line)) is not None]
         start = rest.rfind(b"$")
@@ -64,7 +64,7 @@ class RequestParser:
 
 
 def _request(line: bytes) -> Request | None:
-    """The command that ends ``line``, which a CR followed."""
+    """Return the command that ends ``line``, which a CR followed."""
     match = _COMMAND.fullmatch(line[line.rfind(b"$") :][:MAX_COMMAND_BYTES])
     if match is None:
         return None
@@ -85,7 +85,7 @@ class Answer(NamedTuple):
 
 
 def answer_wire(wire: bytes, text: str) -> bytes:
-    """What the device sends upon the command ``wire``: echo, answer, ``ready``."""
+    """Return what the device sends upon the command ``wire``: echo, answer, ``ready``."""
     separator = b"\r\n" if text else b""
     return wire + text.encode() + separator + READY
 
@@ -112,16 +112,16 @@ class DollarStream:
         self._answers.clear()
 
     def expect(self, wire: bytes) -> None:
-        """The command ``wire`` is about to be sent."""
+        """Await the answer to the command ``wire``, which is about to be sent."""
         self._pending = wire
         self._answers.clear()
 
     def take_answer(self) -> Answer | None:
-        """The answer to the last command, once."""
+        """Return the answer to the last command, once."""
         return self._answers.pop() if self._answers else None
 
     def feed(self, data: bytes) -> list[Records]:
-        """Telegrams that ``data`` completes, in order."""
+        """Return telegrams that ``data`` completes, in order."""
         self._held += data
         found: list[Records] = []
         while self._held:
@@ -143,7 +143,7 @@ class DollarStream:
             self._receive()
 
     def settle(self) -> list[Records]:
-        """The last telegram before a silence, if it is whole."""
+        """Return the last telegram before a silence, if it is whole."""
         if self._answering or self.decoder is None:
             return []
         found = self._decode(self._held) if not self._pending else []
@@ -151,7 +151,7 @@ class DollarStream:
         return [records for records in [*found, self.decoder.settle()] if len(records)]
 
     def _listen(self, found: list[Records]) -> bool:
-        """Telegrams up to the echo; whether it has come."""
+        """Return telegrams up to the echo; whether it has come."""
         # Some echo neither the CR nor the case.
         echo, held = self._pending.rstrip(b"\r").lower(), self._held.lower()
         place = held.find(echo)
@@ -169,7 +169,7 @@ class DollarStream:
         return True
 
     def _receive(self) -> bool:
-        """The answer up to ``ready``; whether it is complete."""
+        """Return the answer up to ``ready``; whether it is complete."""
         match = _READY.search(self._held)
         if match is None:
             self._held = self._held[-MAX_ANSWER_BYTES:]
@@ -190,7 +190,7 @@ class DollarStream:
 
 
 def _overlap(data: bytes, word: bytes) -> int:
-    """Length of the longest end of ``data`` that begins ``word``."""
+    """Return the length of the longest end of ``data`` that begins ``word``."""
     for length in range(min(len(data), len(word) - 1), 0, -1):
         if data.endswith(word[:length]):
             return length

@@ -59,7 +59,7 @@ class BinaryDecoder:
         self._synchronised = synchronised
 
     def feed(self, data: bytes) -> Records:
-        """Telegrams that ``data`` confirms, shape (n,); n may be 0."""
+        """Return telegrams that ``data`` confirms, shape (n,); n may be 0."""
         self._received += len(data)
         self._buffer += data
         parts = []
@@ -72,7 +72,7 @@ class BinaryDecoder:
         return found
 
     def settle(self) -> Records:
-        """The last telegram, if it is whole and nothing came after it; shape (0,) or (1,)."""
+        """Return the last telegram, if whole and nothing came after it; shape (0,) or (1,)."""
         whole = len(self._buffer) == self._layout.length
         if not (self._synchronised and whole and self._buffer.startswith(self._layout.sync)):
             return np.empty(0, self._dtype)
@@ -94,7 +94,7 @@ class BinaryDecoder:
         )
 
     def _take(self) -> bytes:
-        """Telegrams up to the last one whose successor has begun, or to a missing sync."""
+        """Return telegrams up to the last one whose successor has begun, or to a missing sync."""
         length, buffer = self._layout.length, self._buffer
         whole = len(buffer) // length
         records = np.frombuffer(buffer, self._dtype, whole)
@@ -131,7 +131,7 @@ class BinaryDecoder:
         return self._synchronised
 
     def _plausible(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Where the sample counter, if there is one, goes on between two telegrams."""
+        """Return where the sample counter, if there is one, goes on between two telegrams."""
         if SAMPLE_COUNTER not in self._layout.signals:
             return np.ones(len(starts), np.bool_)
         index = self._layout.signals.index(SAMPLE_COUNTER)
@@ -167,7 +167,7 @@ class LineDecoder:
         self._synchronised = synchronised
 
     def feed(self, data: bytes) -> Records:
-        """Telegrams completed by ``data``, shape (n,); n may be 0."""
+        """Return telegrams completed by ``data``, shape (n,); n may be 0."""
         self._received += len(data)
         *lines, tail = (self._tail + data).split(b"\n")
         good = [line for line in lines if self._well_formed(line)]
@@ -188,7 +188,7 @@ class LineDecoder:
         return self._records(values)
 
     def settle(self) -> Records:
-        """Nothing: a line tells its end by itself; shape (0,)."""
+        """Return no telegram, shape (0,): a line says by itself where it ends."""
         return np.empty(0, self._dtype)
 
     @property
@@ -205,7 +205,7 @@ class LineDecoder:
         return len(line) <= MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
 
     def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Which rows of ``values`` (n, signals) their types can hold, shape (n,)."""
+        """Return which rows of ``values`` (n, signals) their types can hold, shape (n,)."""
         lowest, highest, whole = self._limits
         inside = (values >= lowest) & (values <= highest)
         return np.asarray((inside & (~whole | (values == np.rint(values)))).all(axis=1))
@@ -218,7 +218,7 @@ class LineDecoder:
 
 
 def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Lowest and highest value of each signal (signals,), and whether it is a whole number."""
+    """Return each signal's least and greatest value (signals,), and whether it is whole."""
     kinds = [np.dtype(FORMATS[kind]) for kind in layout.types]
     ranges = [np.finfo(kind) if kind.kind == "f" else np.iinfo(kind) for kind in kinds]
     lowest, highest = ([float(getattr(r, end)) for r in ranges] for end in ("min", "max"))

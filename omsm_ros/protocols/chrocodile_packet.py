@@ -47,7 +47,7 @@ Value: TypeAlias = int | float | str | bytes
 
 
 def name_code(name: str) -> int:
-    """Number of a command: its letters, low byte first; ConfigurationError if it has none."""
+    """Return a command's number: its letters, low byte first; ConfigurationError if none."""
     if not (name.isascii() and name.isupper() and 3 <= len(name) <= 4):
         raise ConfigurationError(f"command {name!r}, expected three or four capitals")
     return int.from_bytes(name.encode(), "little")
@@ -146,7 +146,7 @@ def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
 
 
 def decode_command(body: bytes) -> Command:
-    """Command in the body of a packet; ProtocolError or struct.error if it makes no sense."""
+    """Return the command in a packet's body; ProtocolError or struct.error if it is none."""
     code, _, _, flags, _, ticket, count = _COMMAND.unpack_from(body)
     name = code.to_bytes(4, "little").rstrip(b"\0").decode("latin-1")
     values: list[Value] = []
@@ -160,7 +160,7 @@ def decode_command(body: bytes) -> Command:
 
 
 def _decode_argument(kind: int, body: bytes, place: int) -> tuple[Value, int]:
-    """Value and size [bytes] of the argument at ``place``."""
+    """Return the value and size [bytes] of the argument at ``place``."""
     if kind in (INT, REAL):
         (number,) = struct.unpack_from("<i" if kind == INT else "<f", body, place)
         return number, 4
@@ -178,7 +178,7 @@ def _decode_argument(kind: int, body: bytes, place: int) -> tuple[Value, int]:
 
 
 def decode_format(body: bytes) -> DataFormat:
-    """Data format in the body of a packet; ProtocolError or struct.error if it makes none."""
+    """Return the data format in a packet's body; ProtocolError or struct.error if none."""
     stream, counter, rate, count = _FORMAT.unpack_from(body)
     rows = [_SIGNAL.unpack_from(body, _FORMAT.size + i * _SIGNAL.size) for i in range(count)]
     signals = tuple((number, kind, channels) for kind, _, channels, _, number in rows)

@@ -61,7 +61,7 @@ class PacketDecoder:
         self._formats.clear()
 
     def feed(self, data: bytes) -> list[Message]:
-        """Messages completed by ``data``, in order; neighbouring samples of one format in one."""
+        """Return messages completed by ``data``; neighbouring samples of one format in one."""
         self._received += len(data)
         self._buffer += data
         found: list[Message] = []
@@ -92,7 +92,7 @@ class PacketDecoder:
         )
 
     def _length(self, place: int) -> int | None:
-        """Length of the packet at ``place``; 0 = it is none; None = not all here yet."""
+        """Return the length of the packet at ``place``; 0 = it is none; None = not all here yet."""
         if place + HEADER.size > len(self._buffer):
             return None
         _, length, kind = HEADER.unpack_from(self._buffer, place)
@@ -104,7 +104,7 @@ class PacketDecoder:
         return length if place + length <= len(self._buffer) else None
 
     def _cut_off(self, place: int, length: int) -> bool:
-        """Whether the next packet begins inside the one at ``place``: its end is missing."""
+        """Return whether the next packet begins inside the one at ``place``: its end is missing."""
         end = place + length + len(MAGIC_BYTES) - 1  # it may also begin in the last bytes
         inside = self._buffer.find(MAGIC_BYTES, place + 4, end)
         while inside >= 0 and inside + HEADER.size <= len(self._buffer):
@@ -176,7 +176,7 @@ class PacketDecoder:
 
 
 def _after(form: DataFormat, records: Records, within: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Time after the packet's [ns] of the ``within``-th sample of a packet."""
+    """Return the time after the packet's [ns] of the ``within``-th sample of a packet."""
     if str(TIME_OFFSET) in (records.dtype.names or ()):
         fraction = records[str(TIME_OFFSET)].astype(np.float64) / FIXED_POINT
         return np.rint(fraction * NANOSECONDS_PER_S).astype(np.int64)

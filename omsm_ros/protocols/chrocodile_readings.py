@@ -62,28 +62,28 @@ class ProbeReading:
             raise ConfigurationError(f"zero {self.zero!r} m, expected a finite number")
 
     def unit(self, signal: int) -> float:
-        """Metres per step of a distance signal."""
+        """Return the step of a distance signal [m]."""
         sixteen = self.full_scale / 2**15
         return {DISTANCE: MICROMETRE_M, DISTANCE_NM: NANOMETRE_M, DISTANCE_16: sixteen}[signal]
 
     def distance(self, raw: FloatArray) -> FloatArray:
-        """Distance [m] of a reading [m]."""
+        """Return the distance [m] of a reading [m]."""
         return self.polarity * (raw - self.zero)
 
     def raw(self, distance: FloatArray) -> FloatArray:
-        """Reading [m] at a distance [m]."""
+        """Return the reading [m] at a distance [m]."""
         return self.zero + self.polarity * distance
 
 
 def first_of(choice: Sequence[int], signals: Sequence[int]) -> int | None:
-    """The first of ``choice`` that is among ``signals``."""
+    """Return the first of ``choice`` that is among ``signals``."""
     return next((number for number in choice if number in signals), None)
 
 
 def distance_of(
     records: Records, signals: Sequence[int], probe: ProbeReading
 ) -> tuple[FloatArray, NDArray[np.float32], NDArray[np.uint8]]:
-    """Distance [m], intensity (0-1; NaN where not selected) and status of ``records`` (n,).
+    """Return distance [m], intensity (0-1; NaN where not selected) and status of ``records`` (n,).
 
     Distance zero and intensity zero together are no target; so is distance zero alone where
     no intensity is selected. Raises ConfigurationError if no distance is.
@@ -109,7 +109,7 @@ def distance_of(
 
 
 def counts_of(records: Records, latch: str, order: Sequence[int]) -> IntArray:
-    """Encoder counts (n, 5) of X, Y, Z, B, C, latched as ``latch`` says.
+    """Return the encoder counts (n, 5) of X, Y, Z, B, C, latched as ``latch`` says.
 
     order: which of the device's encoders X Y Z U V (0 to 4) is on each axis. The mean of
     start and end is rounded to a whole count.

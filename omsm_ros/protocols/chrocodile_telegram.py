@@ -98,7 +98,7 @@ class Layout:
 
     @classmethod
     def of(cls, signals: Sequence[int], sync: bytes = SYNC) -> Layout:
-        """Layout that the table ``SIGNALS`` gives for a selection by `$SODX`.
+        """Return the layout that the table ``SIGNALS`` gives for a selection by `$SODX`.
 
         Raises ConfigurationError for a signal whose type only `$DTF` knows.
         """
@@ -113,7 +113,7 @@ class Layout:
 
     @classmethod
     def described(cls, text: str, sync: bytes = SYNC) -> Layout:
-        """Layout that an answer to `$DTF` tells: length, then number, type, offset of each signal.
+        """Return the layout in an answer to `$DTF`: length; number, type, offset of each signal.
 
         Separators, a count of signals after the length, and whether length and offsets count
         the sync are left open. Raises ProtocolError.
@@ -135,7 +135,7 @@ class Layout:
         return cls(tuple(signals), tuple(types), tuple(p + before for p in places), length, sync)
 
     def describe(self) -> str:
-        """What the device answers to `$DTF`."""
+        """Return what the device answers to `$DTF`."""
         triples = zip(self.signals, self.types, self.offsets, strict=True)
         return " ".join([str(self.length), *(f"{n} {t} {o}" for n, t, o in triples)])
 
@@ -152,13 +152,13 @@ class Layout:
         )
 
     def records(self, count: int) -> Records:
-        """Empty telegrams (count,), their sync filled in."""
+        """Return the empty telegrams (count,), their sync filled in."""
         made = np.zeros(count, self.dtype)
         made["sync"] = int.from_bytes(self.sync, "big")
         return made
 
     def lines(self, records: Records) -> list[bytes]:
-        """The same records (n,) as ASCII telegrams."""
+        """Return the same records (n,) as ASCII telegrams."""
         columns = []
         for number, kind in zip(self.signals, self.types, strict=True):
             form = "%.4f" if kind == FLOAT else "%d"

@@ -37,7 +37,7 @@ def encode_frames(values: IntArray) -> bytes:
 
 
 def distance_of(values: IntArray, measuring_range: float) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Distance [m], NaN where there is none, and status of 18-bit ``values`` (n,).
+    """Return the distance [m], NaN where there is none, and status of 18-bit ``values`` (n,).
 
     measuring_range: [m]
     """
@@ -49,7 +49,7 @@ def distance_of(values: IntArray, measuring_range: float) -> tuple[FloatArray, N
 
 
 def values_of(distance: FloatArray, measuring_range: float) -> IntArray:
-    """18-bit values of ``distance`` [m] (n,); NaN becomes "no peak"."""
+    """Return 18-bit values of ``distance`` [m] (n,); NaN becomes "no peak"."""
     scaled = np.rint(np.nan_to_num(distance) * (SPAN / measuring_range)) + ZERO
     inside = np.clip(scaled, 0, LAST_VALUE).astype(np.int64)
     return np.where(np.isnan(distance), NO_PEAK, inside)
@@ -87,7 +87,7 @@ class SerialDecoder:
         self._buffer = b""
 
     def feed(self, data: bytes) -> tuple[IntArray, IntArray]:
-        """Values (n, width) of the frames completed by ``data``, and how many were spoilt.
+        """Return values (n, width) of the frames completed by ``data``, and how many were spoilt.
 
         The second, (n,), tells for each frame in how many places since the frame before it
         something was wrong.
@@ -122,7 +122,7 @@ class SerialDecoder:
         )
 
     def _starts(self, raw: NDArray[np.uint8]) -> NDArray[np.intp]:
-        """Places where whole frames begin; frames never overlap, since their marks do not."""
+        """Return where whole frames begin; frames never overlap, since their marks do not."""
         if len(raw) < self._size:
             return np.empty(0, np.intp)
         windows = np.lib.stride_tricks.sliding_window_view(raw >> 6, self._size)

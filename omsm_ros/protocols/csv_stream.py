@@ -41,7 +41,7 @@ def check_columns(columns: Sequence[str]) -> None:
 
 
 def row_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
-    """One line: whole numbers int64, the others float64."""
+    """Return one line: whole numbers int64, the others float64."""
     named = [name for name in columns if name != SKIPPED]
     return np.dtype([(name, "<i8" if name in _WHOLE else "<f8") for name in named])
 
@@ -83,7 +83,7 @@ class CsvDecoder:
         self._tail = b""
 
     def feed(self, data: bytes) -> NDArray[np.void]:
-        """Rows completed by ``data``, shape (n,)."""
+        """Return the rows completed by ``data``, shape (n,)."""
         self._received += len(data)
         *lines, tail = (self._tail + data).split(b"\n")
         self._tail = tail[: MAX_LINE_BYTES + 1]

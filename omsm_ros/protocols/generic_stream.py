@@ -82,7 +82,7 @@ class FrameDecoder:
         self._bad = {"length": 0, "cobs": 0, "crc": 0}
 
     def feed(self, data: bytes) -> FrameArray:
-        """Frames completed by ``data``, shape (n,), in the order of arrival; n may be 0."""
+        """Return frames completed by ``data``, shape (n,), in the order of arrival; n may be 0."""
         self._bytes += len(data)
         *segments, tail = (self._tail + data).split(TERMINATOR)
         # A byte more than a frame already tells that this segment is none: keep no more of it.
@@ -166,17 +166,17 @@ class AxisScaling:
             raise ConfigurationError(f"wrap {self.wrap!r} counts, expected 0 (never) or more")
 
     def values(self, counts: IntArray) -> FloatArray:
-        """Positions [m or rad] of unwrapped ``counts`` (n,)."""
+        """Return the positions [m or rad] of unwrapped ``counts`` (n,)."""
         return self.offset + counts / (self.sign * self.counts_per_unit)
 
     def counts(self, values: FloatArray) -> IntArray:
-        """What the encoder reports at ``values`` [m or rad] (n,), rounded to whole counts."""
+        """Return what the encoder reports at ``values`` [m or rad] (n,), in whole counts."""
         scaled = np.rint((values - self.offset) * (self.sign * self.counts_per_unit))
         whole = _integers("axis position", scaled, np.int64).astype(np.int64)
         return whole % self.wrap if self.wrap else whole
 
     def unwrap(self, counts: IntArray, previous: int) -> IntArray:
-        """Counts (n,) continued from ``previous``, the last unwrapped count.
+        """Return the counts (n,) continued from ``previous``, the last unwrapped count.
 
         The axis moves less than half a wrap between two samples.
         """
@@ -209,7 +209,7 @@ class ProbeScaling:
             raise ConfigurationError(f"invalid {self.invalid!r} nm does not fit an int32")
 
     def readings(self, frames: FrameArray) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """Distance [m], NaN where there is none, and status, each of shape (n,).
+        """Return the distance [m], NaN where there is none, and status, each of shape (n,).
 
         What the device calls bad stays so; a status this package does not know is LOST.
         """
@@ -223,14 +223,14 @@ class ProbeScaling:
         return distance, np.where(beyond, Status.OUT_OF_RANGE, status).astype(np.uint8)
 
     def counts(self, distance: FloatArray) -> NDArray[np.int32]:
-        """What the device sends for ``distance`` [m] (n,); NaN is sent as ``invalid``."""
+        """Return what the device sends for ``distance`` [m] (n,); NaN is sent as ``invalid``."""
         scaled = np.rint(distance * (self.polarity / NANOMETRE_M))
         sent = np.where(np.isnan(distance), self.invalid, scaled)
         return _integers("probe distance", sent, np.int32).astype(np.int32)
 
 
 def known_status(frames: FrameArray) -> NDArray[np.bool_]:
-    """True where the device's verdict is one of ``Status``, shape (n,)."""
+    """Return True where the device's verdict is one of ``Status``, shape (n,)."""
     return np.asarray(frames["status"] <= max(Status))
 
 

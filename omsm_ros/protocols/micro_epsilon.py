@@ -110,7 +110,7 @@ def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
 
 
 def channel_dtype(field: int) -> np.dtype[np.void]:
-    """What the channel field of a capaNCDT says a frame holds: 24-bit values by channel."""
+    """Return what the channel field of a capaNCDT says a frame holds: 24-bit values by channel."""
     present = [f"channel {i + 1}" for i in range(32) if field >> 2 * i & 0b11]
     if not present:
         raise ProtocolError(f"channel field {field:#x} names no channel")
@@ -157,7 +157,7 @@ class BlockDecoder:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[Block]:
-        """Blocks completed by ``data``, in order."""
+        """Return the blocks completed by ``data``, in order."""
         self._received += len(data)
         self._buffer += data
         found: list[Block] = []
@@ -194,7 +194,7 @@ class BlockDecoder:
         return min((place for place in places if place >= 0), default=-1)
 
     def _size(self, place: int) -> int | None:
-        """Bytes of the block at ``place``; 0 = it is none; None = not all here yet."""
+        """Return the bytes of the block at ``place``; 0 = it is none; None = not all here yet."""
         if place + self._header.size > len(self._buffer):
             return None
         shape = self._shape(self._header.unpack_from(self._buffer, place))
@@ -216,7 +216,7 @@ class BlockDecoder:
         return (count, width) if count else None
 
     def _cut_off(self, place: int, size: int) -> bool:
-        """Whether another block begins inside the one at ``place``, or none at its end."""
+        """Return whether another block begins inside the one at ``place``, or none at its end."""
         end = place + size
         after = self._buffer[end:][: len(PREAMBLES[0])]
         if not any(preamble.startswith(after) for preamble in PREAMBLES):

@@ -113,7 +113,7 @@ def check_definition(path: Path, connection: Connection, ours: Typestore) -> Non
 
 @lru_cache(maxsize=64)
 def _hash_of(definition: MessageDefinition, name: str) -> str:
-    """RIHS01 of a definition that a bag carries; empty if it carries none."""
+    """Return RIHS01 of a definition that a bag carries; empty if it carries none."""
     if definition.format is MessageDefinitionFormat.NONE:
         return ""
     store = get_typestore(Stores.EMPTY)

@@ -131,7 +131,7 @@ class BagReader:
         self._stack.close()
 
     def topics(self) -> list[TopicSummary]:
-        """What is in the bag, by topic name; the channels of a topic count as one."""
+        """Return what is in the bag, by topic name; the channels of a topic count as one."""
         counts: Counter[tuple[str, str]] = Counter()
         for connection in self._reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
@@ -163,7 +163,7 @@ class BagReader:
         return self.start_ns if self.start_ns >= _CLOCK_SET_NS else None
 
     def count(self, topics: Sequence[str]) -> int:
-        """Number of messages on ``topics``."""
+        """Return the number of messages on ``topics``."""
         return sum(t.messages for t in self.topics() if t.role in topics)
 
     def messages(
@@ -190,7 +190,7 @@ class BagReader:
             yield topic, self._record(topic, raw)
 
     def probe_settings(self) -> list[dict[str, object]]:
-        """Each state that the probe's driver told of itself; none where nobody recorded it."""
+        """Return each state that the probe's driver reported; none where nobody recorded it."""
         if not self.count([PROBE_TOPIC]):
             return []
         found: list[dict[str, object]] = []
@@ -246,7 +246,7 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Serialised messages; all of them must be as many as the bag promises."""
+        """Yield the serialised messages; all of them must be as many as the bag promises."""
         promised = sum(connection.msgcount for connection in connections)
         with translated(self.path, DAMAGED):
             if connections:

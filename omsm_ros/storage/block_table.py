@@ -88,7 +88,7 @@ def long_blocks(kind: type, messages: Sequence[bytes]) -> Iterator[Any] | None:
 
 
 def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
-    """A block for each run of rows that continue each other in count, period and time."""
+    """Yield a block for each run of rows that continue each other in count, period and time."""
     first, period = table["first_sample"], table["sample_period"]
     stamp = table["sec"].astype(np.int64) * NANOSECONDS_PER_S + table["nanosec"]
     present = [(name, c) for name, c in CHANNELS[kind] if name in (table.dtype.names or ())]

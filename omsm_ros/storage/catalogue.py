@@ -123,12 +123,12 @@ class Catalogue:
 
     @staticmethod
     def _reason(err: Exception) -> str:
-        """What the database said, without the statement and the link to a manual."""
+        """Return what the database said, without the statement and the link to a manual."""
         text = str(err).partition("[SQL")[0].partition("(Background")[0]
         return " ".join(text.split())[:200]
 
     def _shown_address(self) -> str:
-        """The address without its password."""
+        """Return the address without its password."""
         return str(self._sql.engine.make_url(self.address).render_as_string(hide_password=True))
 
 
@@ -155,7 +155,7 @@ _MEASUREMENT_FIGURES = (
 
 
 def _tables(sql: Any) -> dict[str, Any]:
-    """Times are UTC, lengths [m], delays [s], frequencies [Hz]; an unknown number is NULL."""
+    """Return the tables: times UTC, lengths [m], delays [s], frequencies [Hz]; NULL: unknown."""
     known = sql.MetaData()
 
     def table(name: str, texts: Sequence[str], figures: Sequence[str], *more: Any) -> Any:

@@ -70,7 +70,7 @@ class PlyWriter:
 
 
 def _header_lines(points: int) -> list[bytes]:
-    """What the header of every cloud of ours says, but for comments."""
+    """Return what the header of every cloud of ours says, but for comments."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}"]
     lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
     return [line.encode("ascii") for line in lines]
@@ -112,7 +112,7 @@ class CloudFile:
                 yield rows
 
     def read(self, most: int | None = None) -> NDArray[np.void]:
-        """All points, or evenly every k-th so that there are no more than ``most``."""
+        """Return all points, or evenly every k-th so that there are no more than ``most``."""
         every = 1 if most is None else max(-(-self.points // most), 1)
         parts = [part[::every].copy() for part in self.portions(every * 100_000)]
         return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])

@@ -73,7 +73,7 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
 
 
 def _is_named(mapped: ColumnMap) -> bool:
-    """Whether columns have names; where all are called [0], [1], … a text has no line of them."""
+    """Return whether columns have names; where all are [0], [1], … a text has no line of them."""
     names = mapped.names(CHANNELS)
     return not names or not all(_BY_PLACE.fullmatch(name) for name in names)
 
@@ -89,7 +89,7 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
 
 
 def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
-    """SI value of one unit of a column. A unit that is not written is asked for, never guessed."""
+    """Return the SI value of a column's unit. One that is not written is never guessed."""
     units = UNITS[channel]
     if channel == "trigger":
         return 1.0

@@ -41,12 +41,12 @@ class Messages:
     sequence: Callable[[ArrayLike, DTypeLike], Any]
 
     def make(self, name: str, /, **fields: object) -> Any:
-        """A new message ``name`` with all ``fields``."""
+        """Return a new message ``name`` with all ``fields``."""
         return self.classes[name](**fields)
 
 
 def ros_messages() -> Messages:
-    """The message classes of the sourced ROS workspace."""
+    """Return the message classes of the sourced ROS workspace."""
     from builtin_interfaces.msg import Time
     from omsm_msgs import msg
     from sensor_msgs.msg import PointCloud2, PointField
@@ -70,7 +70,7 @@ def _ros_sequence(values: ArrayLike, dtype: DTypeLike) -> array.array[Any]:
 
 
 def stamp_of(message: Any) -> int:
-    """Header stamp of a message [ns]."""
+    """Return the header stamp of a message [ns]."""
     stamp = message.header.stamp
     return int(stamp.sec) * NANOSECONDS_PER_S + int(stamp.nanosec)
 
@@ -135,7 +135,7 @@ def calibration(message: Any) -> Calibration:
 
 
 def probe_settings(message: Any) -> dict[str, object]:
-    """What a probe's driver told of itself, a JSON object in a ``std_msgs/String``."""
+    """Return what a probe's driver told of itself, a JSON object in a ``std_msgs/String``."""
     return _json_object("probe_settings", message.data)
 
 
@@ -149,7 +149,7 @@ def _json_object(name: str, text: str) -> dict[str, object]:
 
 
 def cloud_array(message: Any) -> NDArray[np.void]:
-    """Points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``."""
+    """Return the points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``."""
     if message.point_step != POINT_DTYPE.itemsize or message.is_bigendian:
         raise CalibrationError(
             f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}"
@@ -161,7 +161,7 @@ def cloud_array(message: Any) -> NDArray[np.void]:
 
 
 def header(messages: Messages, stamp_ns: int, frame: str) -> Any:
-    """A std_msgs/Header."""
+    """Return a std_msgs/Header."""
     sec, nanosec = divmod(stamp_ns, NANOSECONDS_PER_S)
     return messages.make(
         "Header", stamp=messages.make("Time", sec=sec, nanosec=nanosec), frame_id=frame
@@ -177,13 +177,13 @@ def _block_message(messages: Messages, block: Block, frame: str) -> dict[str, An
 
 
 def axis_message(messages: Messages, block: AxisBlock, frame: str = "machine") -> Any:
-    """``omsm_msgs/AxisBlock`` of a record."""
+    """Return ``omsm_msgs/AxisBlock`` of a record."""
     channels = {n: messages.sequence(getattr(block, n), np.float64) for n in _AXES}
     return messages.make("AxisBlock", **_block_message(messages, block, frame), **channels)
 
 
 def distance_message(messages: Messages, block: DistanceBlock, frame: str = "probe") -> Any:
-    """``omsm_msgs/DistanceBlock`` of a record."""
+    """Return ``omsm_msgs/DistanceBlock`` of a record."""
     return messages.make(
         "DistanceBlock",
         **_block_message(messages, block, frame),
@@ -194,13 +194,13 @@ def distance_message(messages: Messages, block: DistanceBlock, frame: str = "pro
 
 
 def acceleration_message(messages: Messages, block: AccelerationBlock, frame: str = "probe") -> Any:
-    """``omsm_msgs/AccelerationBlock`` of a record."""
+    """Return ``omsm_msgs/AccelerationBlock`` of a record."""
     channels = {n: messages.sequence(getattr(block, n), np.float64) for n in "xyz"}
     return messages.make("AccelerationBlock", **_block_message(messages, block, frame), **channels)
 
 
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
-    """``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
+    """Return ``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
     certificate = dict(record.certificate)
     if isinstance(record, CalibrationSet):
         certificate[_SET] = record.content()
@@ -228,7 +228,7 @@ def _all_finite(packed: NDArray[np.void]) -> bool:
 def cloud_message(
     messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
 ) -> Any:
-    """``sensor_msgs/PointCloud2`` of packed points (n,) of ``POINT_DTYPE``."""
+    """Return ``sensor_msgs/PointCloud2`` of packed points (n,) of ``POINT_DTYPE``."""
     offsets = POINT_DTYPE.fields or {}
     fields = [
         messages.make(

@@ -39,7 +39,7 @@ def load_disturbances(path: Path | str) -> Disturbances:
 
 
 def _schema_of(kind: Any) -> dict[str, Any]:
-    """The JSON schema of a field's type: a record, a row of records, a number, any or none."""
+    """Return the JSON schema of a field's type: record, row of records, number, any or none."""
     kind = _without_none(kind)
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -54,7 +54,7 @@ def _schema_of(kind: Any) -> dict[str, Any]:
 
 
 def _made(kind: Any, content: Any) -> Any:
-    """A record, row or number of ``content``, which follows the schema of ``kind``."""
+    """Return a record, row or number of ``content``, which follows the schema of ``kind``."""
     kind = _without_none(kind)
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -70,7 +70,7 @@ def _names(kind: Any) -> Mapping[str, None]:
 
 
 def _without_none(kind: Any) -> Any:
-    """The type of a field that may also be None, which a file says by leaving it out."""
+    """Return the type of a field that may also be None, which a file says by leaving it out."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         (kind,) = (k for k in typing.get_args(kind) if k is not types.NoneType)
     return kind

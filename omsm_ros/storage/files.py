@@ -61,7 +61,7 @@ def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[byte
 
 
 def said(err: Exception) -> str:
-    """What an exception says, on one line and without the path that the message names already."""
+    """Return what an exception says, on one line, without the path that a message names."""
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
     return " ".join(text.split())[:200] or type(err).__name__
 
@@ -98,7 +98,7 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def beside(target: Path) -> Path:
-    """A name that nobody can foresee, in the folder of ``target``."""
+    """Return a name that nobody can foresee, in the folder of ``target``."""
     # Not made from the target's name, which may have all the characters that a name can have.
     return target.with_name(f".{secrets.token_hex(8)}.part")
 

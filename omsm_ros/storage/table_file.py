@@ -45,7 +45,7 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
 
 
 def numbers_in(body: str, what: str, places: Sequence[int] | None = None) -> FloatArray:
-    """Numbers of a CSV text without its line of names, (lines, columns ``places`` or all).
+    """Return numbers of a CSV text without its line of names, (lines, columns ``places`` or all).
 
     Raises FileError, which calls the text ``what``, for anything but numbers.
     """
@@ -54,7 +54,7 @@ def numbers_in(body: str, what: str, places: Sequence[int] | None = None) -> Flo
 
 
 def rows_in(source: Any, what: str, remedy: str, **layout: Any) -> FloatArray:
-    """Numbers of lines of text, (lines, columns); (0, …) of none.
+    """Return the numbers of lines of text, (lines, columns); (0, …) of none.
 
     source, layout: as numpy.loadtxt takes them
 

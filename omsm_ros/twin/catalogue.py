@@ -38,7 +38,7 @@ _THREE_WAVES = (5e-9, 10e-9, 20e-9)
 
 
 def _each(family: str, record: Callable[..., Any], name: str, *sizes: Any, **fixed: Any) -> Sizes:
-    """One ``name`` of the ``family``'s record in three sizes."""
+    """Return one ``name`` of the ``family``'s record in three sizes."""
     small, medium, large = (
         Disturbances(**{family: record(**{name: size}, **fixed)}) for size in sizes
     )
@@ -171,7 +171,7 @@ CATALOGUE: dict[str, Sizes] = {
 
 
 def together(first: Record, second: Record) -> Record:
-    """Both disturbances at once, record by record; rows of creep, modes or lines are joined.
+    """Return both disturbances at once, record by record; rows of creep, modes or lines are joined.
 
     Raises ConfigurationError where both set the same number, each to something else.
     """

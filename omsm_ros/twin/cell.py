@@ -94,7 +94,7 @@ class Recording:
     truth: Truth | None = None
 
     def motion_record(self) -> MotionRecord:
-        """The samples on one grid, as an identification takes them."""
+        """Return the samples on one grid, as an identification takes them."""
         reference = [self.reference] if self.reference else []
         return assemble([self.axes], [self.distance], reference)
 
@@ -151,7 +151,7 @@ _STREAMS = (
 
 
 def _random_streams(seed: int) -> dict[str, np.random.Generator]:
-    """Independent random numbers for each use, so that switching one on leaves the others."""
+    """Return independent random numbers for each use: switching one on leaves the others."""
     children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
 
@@ -190,7 +190,7 @@ def _distance(
 def _further_channels(
     scene: Scene, when: Instants, timing: Timing, random: Mapping[str, np.random.Generator]
 ) -> dict[str, Any]:
-    """Reference and acceleration, as far as there are such sensors."""
+    """Return the reference and acceleration, as far as there are such sensors."""
     channels: dict[str, Any] = {}
     if reference := scene.disturbances.reference:
         channels["reference"] = reference.read(
@@ -206,7 +206,7 @@ def _further_channels(
 
 
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:
-    """The recording cut into blocks of ``size`` samples, as a driver publishes them."""
+    """Return the recording cut into blocks of ``size`` samples, as a driver publishes them."""
     axes, distance = recording.axes, recording.distance
     pairs = []
     for start in range(0, len(axes), size):

@@ -46,7 +46,7 @@ class ReferenceSensor:
     def read(
         self, carriage: Trajectory, time: FloatArray, period: float, random: np.random.Generator
     ) -> DistanceBlock:
-        """What it reports of the carriage for the triggers at ``time`` (n,) [s]."""
+        """Return what it reports of the carriage for the triggers at ``time`` (n,) [s]."""
         z = carriage.at(time - self.latency_s)
         said = z * (1 + self.scale_ppm * PPM) + self.cubic_m * (z / self.half_range_m) ** 3
         in_range = abs(z) <= self.half_range_m
@@ -92,7 +92,7 @@ class Accelerometer:
         period: float,
         random: np.random.Generator,
     ) -> AccelerationBlock:
-        """What it reports of the probe's ``acceleration`` (n,) [m/s²], every ``period`` [s]."""
+        """Return what it reports of the probe's ``acceleration`` (n,), every ``period`` [s]."""
         z = self._high_passed(acceleration, period) * (1 + self.scale_ppm * PPM)
         noise = random.normal(0.0, self.noise_m_per_s2, (3, len(z)))
         return AccelerationBlock(
@@ -111,6 +111,6 @@ class Accelerometer:
 
 
 def acceleration_of(motion: Trajectory) -> Trajectory:
-    """Second derivative of a motion [m/s²], by differences; 0.1 % low at a fiftieth of its rate."""
+    """Return the second derivative of a motion [m/s²]; 0.1 % low at a fiftieth of its rate."""
     second = np.diff(motion.values, 2) / motion.step**2
     return Trajectory(motion.start + motion.step, motion.step, second)

@@ -55,13 +55,13 @@ class ClockErrors:
         return self.z_latch_late_s - self.probe_offset_s
 
     def reach_s(self, duration: float) -> float:
-        """No sample is taken further than this from its nominal instant [s]."""
+        """Return how far a sample is taken from its nominal instant at most [s]."""
         jitter = _JITTER_LIMIT * (self.trigger_jitter_s + self.probe_jitter_s)
         late = max(abs(self.z_latch_late_s), abs(self.c_latch_late_s), abs(self.probe_offset_s))
         return jitter + late + abs(self.probe_drift_ppm) * PPM * duration
 
     def instants(self, time: FloatArray, random: np.random.Generator) -> Instants:
-        """Instants of all devices for nominal ones ``time`` (n,) [s]."""
+        """Return the instants of all devices for nominal ones ``time`` (n,) [s]."""
         if is_default(self):
             return Instants(time, time, time, time)
         together, alone = np.clip(random.normal(size=(2, len(time))), -_JITTER_LIMIT, _JITTER_LIMIT)

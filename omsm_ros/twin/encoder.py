@@ -43,7 +43,7 @@ class Pitch:
         return [self.rad_per_m_s2 * omega**2, 0.0, 0.0], ratio
 
     def angle(self, carriage: Trajectory) -> FloatArray:
-        """Pitch α [rad] along the carriage's motion, (n,)."""
+        """Return the pitch α [rad] along the carriage's motion, (n,)."""
         z = carriage.values
         steady = self.rad_per_m * z + self.periodic_rad * np.sin(2 * np.pi * z / self.period_m)
         if not self.rad_per_m_s2:
@@ -52,7 +52,7 @@ class Pitch:
         return np.asarray(steady + signal.lfilter(numerator.ravel(), denominator, z - z[0]))
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """``E / X_d`` at ``s`` [rad/s], without the periodic part."""
+        """Return ``E / X_d`` at ``s`` [rad/s], without the periodic part."""
         numerator, denominator = self._mode
         dynamic = np.polyval(numerator, s) / np.polyval(denominator, s)
         return np.asarray(self.arm_m * (self.rad_per_m + dynamic), np.complex128)
@@ -78,14 +78,14 @@ class EncoderErrors:
         check_numbers(self, positive=("signal_period_m",), not_negative=("resolution_m",))
 
     def seen(self, carriage: Trajectory) -> Trajectory:
-        """Position under the encoder [m], before its own errors."""
+        """Return the position under the encoder [m], before its own errors."""
         if self.pitch is None:
             return carriage
         values = carriage.values + self.pitch.arm_m * self.pitch.angle(carriage)
         return Trajectory(carriage.start, carriage.step, values)
 
     def read(self, position: FloatArray, noise: FloatArray) -> FloatArray:
-        """What it says at ``position`` (n,) [m], with ``noise`` (n,) [m]."""
+        """Return what it says at ``position`` (n,) [m], with ``noise`` (n,) [m]."""
         if is_default(self):
             return position + noise
         wave = self.interpolation_m * np.sin(2 * np.pi * position / self.signal_period_m)
@@ -94,6 +94,6 @@ class EncoderErrors:
         return np.asarray(np.round(said / step) * step if step else said, np.float64)
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """Reading per motion of the carriage at ``s`` [rad/s]; what is not linear is not in it."""
+        """Return reading over motion of the carriage at ``s`` [rad/s], its linear part."""
         pitch = self.pitch.response(s) if self.pitch else np.zeros_like(s)
         return np.asarray((1 + self.scale_ppm * PPM) * (1 + pitch), np.complex128)

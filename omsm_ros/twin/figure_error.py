@@ -47,11 +47,11 @@ class FigureError:
                 )
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m], of their broadcast shape."""
+        """Return the height [m] at x, y [m], of their broadcast shape."""
         return self.nominal.height(x, y) + self.error(x, y)
 
     def error(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height above the nominal surface [m] at x, y [m], of their broadcast shape."""
+        """Return the height above the nominal surface [m] at x, y [m], of their broadcast shape."""
         radius, angle = np.hypot(x, y), np.arctan2(y, x)
         rho = radius / self.radius
         first, second = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, 2)
@@ -65,6 +65,6 @@ class FigureError:
         return error + self.scallops(radius) if self.tool_marks else error
 
     def scallops(self, radius: FloatArray) -> FloatArray:
-        """Height of the tool marks [m] at ``radius`` [m]: a parabola from cusp to cusp."""
+        """Return the height of tool marks [m] at ``radius`` [m]: a parabola from cusp to cusp."""
         turn = radius / self.tool_feed
         return np.asarray(self.tool_marks * 4 * (turn - np.rint(turn)) ** 2, np.float64)

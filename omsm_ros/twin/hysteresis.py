@@ -31,7 +31,7 @@ class Driven(Trajectory):
     half_width: float
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Position [m] at ``time`` [s], of its shape; a cubic would round the kinks off."""
+        """Return the position [m] at ``time`` [s], of its shape; a cubic would round its kinks."""
         driver = self.driver.at(time)
         following = np.ceil((time - self.start) / self.step).astype(np.int64)
         held = self.held[np.minimum(following, len(self.held) - 1)]
@@ -40,7 +40,7 @@ class Driven(Trajectory):
 
 
 def backlash(driver: Trajectory, width: float) -> Driven:
-    """What follows ``driver`` through a play of ``width`` [m], in its middle at first."""
+    """Return what follows ``driver`` through a gap of ``width`` [m], at first in its middle."""
     position, half = driver.values, width / 2
     runs, state, states = list(_monotone_runs(position)), position[0], []
     for _, last, up in runs:
@@ -53,7 +53,7 @@ def backlash(driver: Trajectory, width: float) -> Driven:
 
 
 def friction(position: FloatArray, presliding: float) -> FloatArray:
-    """Dahl's friction, -1 to 1 (n,), along ``position`` (n,) [m], none at first.
+    """Return Dahl's friction, -1 to 1 (n,), along ``position`` (n,) [m], none at first.
 
     Along a run of one direction s: ``F = s - (s - F₀) exp(-|z - z₀| / presliding)``.
     """
@@ -67,7 +67,7 @@ def friction(position: FloatArray, presliding: float) -> FloatArray:
 
 
 def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
-    """Pieces ``first:last`` in which the position only rises (True) or only falls, in order."""
+    """Yield pieces ``first:last`` in which the position only rises (True) or only falls."""
     change = np.diff(position, prepend=position[0])
     moving = abs(change) > _STILL_M
     # At rest the direction is that of the last move.

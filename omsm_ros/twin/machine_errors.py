@@ -52,7 +52,7 @@ class Drift:
         )
 
     def height(self, time: FloatArray, walk: Trajectory) -> FloatArray:
-        """Height [m] at ``time`` [s]; ``walk`` is a random walk of one metre per root second."""
+        """Return the height [m] at ``time`` [s]; ``walk``: random, one metre per root second."""
         moved = (
             self.ramp_m_per_s * time
             + self.exponential_m * -np.expm1(-time / self.time_constant_s)
@@ -79,11 +79,11 @@ class Harmonic:
         check_numbers(self)
 
     def along(self, c: FloatArray) -> FloatArray:
-        """First component at spindle angle ``c`` [rad], of its shape."""
+        """Return the first component at spindle angle ``c`` [rad], of its shape."""
         return np.asarray(self.amplitude * np.cos(self.per_turn * c + self.phase_rad), np.float64)
 
     def across(self, c: FloatArray) -> FloatArray:
-        """Second component at spindle angle ``c`` [rad], of its shape."""
+        """Return the second component at spindle angle ``c`` [rad], of its shape."""
         return np.asarray(self.amplitude * np.sin(self.per_turn * c + self.phase_rad), np.float64)
 
 
@@ -113,7 +113,7 @@ class SpindleError:
         return bool(self.axial_noise_m or self.radial_noise_m or self.tilt_noise_rad)
 
     def shift(self, time: FloatArray, slides: AxisPositions, noise: list[Trajectory]) -> Shift:
-        """Of the workpiece under the probe; ``noise``: five signals of unit variance, or none."""
+        """Return the workpiece's shift under the probe; ``noise``: five signals of variance one."""
         c = slides.c
         axial, radial, tilt = self.axial_m, self.radial_m, self.tilt_rad
         z = sum((h.along(c) for h in axial), np.zeros(1))
@@ -144,7 +144,7 @@ class Straightness:
         check_numbers(self, positive=("half_travel_m", "period_m"))
 
     def deviation(self, position: FloatArray) -> FloatArray:
-        """[m] at ``position`` [m], of its shape."""
+        """Return the error [m] at ``position`` [m], of its shape."""
         wave = self.periodic_m * np.sin(2 * np.pi * position / self.period_m)
         return np.asarray(self.bow_m * (position / self.half_travel_m) ** 2 + wave, np.float64)
 
@@ -172,19 +172,19 @@ class MachineErrors:
         check_numbers(self, positive=("b_wobble_hz",))
 
     def slides_shift(self, slides: AxisPositions) -> Shift:
-        """What straightness does to the workpiece against the probe, at the slides' positions."""
+        """Return the workpiece's shift by straightness, at the slides' positions."""
         zero = np.zeros(1)
         along = self.x_slide_along_z.deviation(slides.x)
         # A probe that is carried sideways sees the workpiece go the other way.
         return Shift(-self.z_slide_along_x.deviation(slides.z), zero, along)
 
     def b_wobble(self, time: FloatArray) -> FloatArray:
-        """Swing of B [rad] at ``time`` [s], of its shape."""
+        """Return the swing of B [rad] at ``time`` [s], of its shape."""
         return np.asarray(self.b_wobble_rad * np.sin(2 * np.pi * self.b_wobble_hz * time))
 
 
 def random_walk(times: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Random walk (n,) at equidistant ``times``, of standard deviation √t and zero at time 0."""
+    """Return a random walk (n,) at even ``times``, of standard deviation √t and zero at time 0."""
     steps = random.normal(0.0, np.sqrt(times[1] - times[0]), len(times))
     walk = np.cumsum(steps)
     return np.asarray(walk - walk[np.argmin(abs(times))])

@@ -55,7 +55,7 @@ class PosedSurface:
     pose: PartPose
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m] of the chuck, of their broadcast shape."""
+        """Return the height [m] at x, y [m] of the chuck, of their broadcast shape."""
         pose, turn = self.pose, self.pose.rotation
         across, along = np.asarray(x) - pose.x_m, np.asarray(y) - pose.y_m
         z = np.zeros(np.broadcast(across, along).shape)
@@ -72,5 +72,5 @@ class PosedSurface:
 
 
 def posed(surface: Surface, pose: PartPose) -> Surface:
-    """``surface`` on the chuck; itself where it sits as it should."""
+    """Return ``surface`` on the chuck; itself where it sits as it should."""
     return surface if is_default(pose) else PosedSurface(surface, pose)

@@ -52,7 +52,7 @@ class Plant:
         return TransferFunction.from_ascending([1.0], [1.0, 2 / omega, 1 / omega**2])
 
     def lead_in(self) -> float:
-        """How long the cell must have been moving before its start is forgotten [s]."""
+        """Return how long the cell must have been moving before its start is forgotten [s]."""
         slowest = min(-np.r_[self.servo.poles(), self.dynamics.poles()].real)
         return float(_LEAD_IN_TIME_CONSTANTS / slowest + self.dynamics.delay)
 
@@ -136,7 +136,7 @@ def _seen_through(system: TransferFunction, delay: float, motion: Motion, grid: 
 
 
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
-    """Z commanded in the middle of each of ``count`` steps [s] after ``begin`` [s]."""
+    """Return Z commanded in the middle of each of ``count`` steps [s] after ``begin`` [s]."""
     return motion.positions(begin + (np.arange(count, dtype=np.float64) + 0.5) * step).z
 
 
@@ -149,7 +149,7 @@ def _series(first: TransferFunction, second: TransferFunction) -> TransferFuncti
 
 
 def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArray:
-    """Second-order sections from the held input of a step to the output at its end.
+    """Return the second-order sections from the held input of a step to the output at its end.
 
     Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the held system;
     the gain follows from G(0). A single polynomial of all of them would lose digits.
@@ -173,7 +173,7 @@ def _at_one(roots: ComplexArray) -> complex:
 def _state_space(
     system: TransferFunction, rate: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Controllable canonical form, time in units of 1/rate to keep its entries near 1."""
+    """Return controllable canonical form, time in units of 1/rate to keep its entries near 1."""
     order = len(system.denominator) - 1
     leading = system.denominator[-1] * rate**order
     monic = system.denominator * rate ** np.arange(order + 1) / leading

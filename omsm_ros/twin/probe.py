@@ -102,7 +102,7 @@ class ProbeErrors:
         return any(sizes) or any(limit is not None for limit in limits)
 
     def looks(self) -> tuple[FloatArray, FloatArray]:
-        """Instants before the trigger [s] and their weights, (k,), that stand for the exposure."""
+        """Return instants before the trigger [s] and weights, (k,), that stand for the exposure."""
         if not self.window_s:
             return np.array([self.latency_s]), np.ones(1)
         node, weight = np.polynomial.legendre.leggauss(_EXPOSURE_NODES)
@@ -122,7 +122,7 @@ class Slope(NamedTuple):
 
 
 def slope_of(surface: Surface, x: FloatArray, y: FloatArray, c: FloatArray) -> Slope:
-    """Slope of ``surface`` at x, y [m] of the chuck, turned to the machine by ``c`` [rad]."""
+    """Return the slope of ``surface`` at x, y [m] of the chuck, turned by ``c`` [rad]."""
     h = _SLOPE_STEP_M
     cosine, sine = np.cos(c), np.sin(c)
     along_x = surface.height(x + h * cosine, y - h * sine)
@@ -151,7 +151,7 @@ def read(
     period: float,
     random: ProbeRandom,
 ) -> DistanceBlock:
-    """What the probe reports of ``true_distance`` (n,) [m] to a surface of ``slope``."""
+    """Return what the probe reports of ``true_distance`` (n,) [m] to a surface of ``slope``."""
     samples = len(true_distance)
     light = _light(errors, slope)
     noise = probe.noise if not errors.noise_m else float(np.hypot(probe.noise, errors.noise_m))
@@ -177,7 +177,7 @@ def read(
 def _error(
     probe: Probe, errors: ProbeErrors, distance: FloatArray, slope: Slope
 ) -> FloatArray | float:
-    """What the optics add to ``distance`` (n,) [m]."""
+    """Return what the optics add to ``distance`` (n,) [m]."""
     error: FloatArray | float = 0.0
     if errors.cubic_m:
         error = error + errors.cubic_m * (distance / probe.half_range) ** 3
@@ -191,7 +191,7 @@ def _error(
 
 
 def _light(errors: ProbeErrors, slope: Slope) -> FloatArray:
-    """Light that comes back, per that of a flat, (n,) or (1,)."""
+    """Return the light that comes back, per that of a flat, (n,) or (1,)."""
     if errors.intensity_slope_rad is None:
         return np.ones(1)
     # Never quite dark: a noise without bound would be no noise any more.

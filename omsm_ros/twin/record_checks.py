@@ -59,5 +59,5 @@ def _limit(name: str) -> float:
 
 
 def is_default(record: Any) -> bool:
-    """True if a record is as it is without arguments: nothing is switched on."""
+    """Return True if a record is as it is without arguments: nothing is switched on."""
     return bool(record == type(record)())

@@ -48,12 +48,12 @@ class Scenario:
 
 
 def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """The paper's step test on a fixed flat."""
+    """Return the paper's step test on a fixed flat."""
     return on_a_flat(scenario, StepTest(rise=scenario.step_rise), disturbances)
 
 
 def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """The step test that `omsm plan steps` makes, with rests half as long, on a fixed flat."""
+    """Return the step test of `omsm plan steps`, with rests half as long, on a fixed flat."""
     step = StepTest().step
     motion = plan_steps(
         sample_period=scenario.sample_period,
@@ -69,7 +69,7 @@ def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) ->
 def on_a_flat(
     scenario: Scenario, motion: Motion, disturbances: Disturbances = NOTHING
 ) -> Recording:
-    """A ``motion`` before a fixed flat, its middle in the middle of the probe's range.
+    """Return a ``motion`` before a fixed flat, its middle in the middle of the probe's range.
 
     The flat is no part: it has no pose.
     """
@@ -82,7 +82,7 @@ def on_a_flat(
 
 
 def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """The spiral over the paper's mirror, as it really is."""
+    """Return the spiral over the paper's mirror, as it really is."""
     # Another seed than the step test's: the same noise twice would be no independent check.
     cell = Cell(
         seed=scenario.seed + 1, sample_period=scenario.sample_period, disturbances=disturbances
@@ -91,7 +91,7 @@ def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recordi
 
 
 def spiral_of(scenario: Scenario) -> Spiral:
-    """The commanded motion of the scan, along the nominal mirror."""
+    """Return the commanded motion of the scan, along the nominal mirror."""
     return Spiral(
         PAPER_MIRROR, scenario.start_radius, scenario.feed_per_turn, scenario.spindle_speed
     )

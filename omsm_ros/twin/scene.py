@@ -83,14 +83,14 @@ class Scene:
     vibration: Vibration
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """True positions of the axes, as commanded but for the wobble of B."""
+        """Return True positions of the axes, as commanded but for the wobble of B."""
         slides = self.motion.positions(time)
         if not self.disturbances.machine.b_wobble_rad:
             return slides
         return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
 
     def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> Look:
-        """What is before the probe at ``time`` (n,) [s], ``about`` so far away [m]."""
+        """Return what is before the probe at ``time`` (n,) [s], ``about`` so far away [m]."""
         slides = self.positions(time)
         x, y, raised = self._shift(time, slides)
         shifted = slides._replace(x=slides.x - x, y=slides.y - y)
@@ -103,7 +103,7 @@ class Scene:
         return self._along_the_beam(mount, shifted, probe, raised, about)
 
     def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
-        """Of the workpiece against the probe, all in all."""
+        """Return the whole shift of the workpiece against the probe."""
         total = Shift(np.zeros(1), np.zeros(1), np.zeros(1))
         for shifting in self.shifting:
             part = shifting(time, slides)
@@ -118,7 +118,7 @@ class Scene:
         raised: FloatArray,
         about: FloatArray | float,
     ) -> Look:
-        """As ``look``, for a beam that slants or a probe that B carries about."""
+        """Return what ``look`` does, for a beam that slants or a probe that B carries about."""
         zero = probe + self.stand_off - raised
         distance = np.zeros_like(probe) + about
         for _ in range(_MOST_BEAM_ITERATIONS):
@@ -131,7 +131,7 @@ class Scene:
         return Look(probe, height, at.x, at.y, distance)
 
     def over_an_exposure(self, time: FloatArray) -> Look:
-        """The mean of what is before the probe while it looks for the triggers at ``time``."""
+        """Return the mean of what is before the probe during the exposures at ``time``."""
         probe = self.disturbances.probe
         before, weights = probe.looks()
         look = self.look(time - before[0])
@@ -147,7 +147,7 @@ class Scene:
         return look._replace(distance=look.distance + shaken)
 
     def acceleration(self, time: FloatArray, period: float) -> FloatArray:
-        """Of the probe along Z [m/s²] at ``time`` (n,) [s]."""
+        """Return the acceleration of the probe along Z [m/s²] at ``time`` (n,) [s]."""
         c = self.motion.positions(time).c
         speed = np.asarray(np.gradient(c, period))
         shaken = self.vibration.acceleration(time, c, speed)
@@ -187,7 +187,7 @@ def scene_of(
 
 
 def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> list[Shifting]:
-    """What is switched on of all that moves the workpiece; ``times`` span the simulation."""
+    """Return what is switched on of all that moves the workpiece; ``times`` span the simulation."""
     machine, zero = disturbances.machine, np.zeros(1)
     result: list[Shifting] = []
     if not is_default(machine.drift):

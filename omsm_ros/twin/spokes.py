@@ -39,7 +39,7 @@ class Spokes:
         return max(round(2 * np.pi * self.radius / self.wavelength), 1)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m], of their broadcast shape."""
+        """Return the height [m] at x, y [m], of their broadcast shape."""
         phase = self.count * np.arctan2(y, x)
         waves = np.cos(phase) + self.second * np.cos(2 * phase)
         return np.asarray(self.nominal.height(x, y) + 2**0.5 * self.rms * waves, np.float64)

@@ -147,7 +147,7 @@ class StructureErrors:
         return _SPIN_UP_S if self.relaxations or self.soft_modes else 0.0
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """Creep and soft modes at complex ``s`` [rad/s]; what is not linear is not in it."""
+        """Return creep and soft modes at complex ``s`` [rad/s]; what is not linear is not in it."""
         result = np.ones_like(s)
         for creep in self.relaxations:
             result += creep.fraction * (1 / (1 + s * creep.time_constant_s) - 1)
@@ -158,7 +158,7 @@ class StructureErrors:
 
 
 def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Movement:
-    """What becomes of the probe's motion ``moved`` in a structure with ``errors``.
+    """Return what becomes of the probe's motion ``moved`` in a structure with ``errors``.
 
     slide_x: position of X [m], on any grid as long as that of ``moved``
     """
@@ -181,7 +181,7 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
 
 
 def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
-    """What creep and soft modes add to the motion of the probe (n,) [m]."""
+    """Return what creep and soft modes add to the motion of the probe (n,) [m]."""
     if not errors.lead_s:
         return np.zeros(1)
     every = max(int(_slow_step(errors) / probe.step), 1)
@@ -208,7 +208,7 @@ def _slow_step(errors: StructureErrors) -> float:
 
 
 def _spun_up(probe: Trajectory) -> FloatArray:
-    """The motion, coming up smoothly from rest at its mean before time 0, about that mean."""
+    """Return the motion about its mean, coming up smoothly from rest there before time 0."""
     before = max(round(-probe.start / probe.step), 1)
     mean = probe.values[:before].mean()
     moving = probe.values - mean
@@ -217,13 +217,13 @@ def _spun_up(probe: Trajectory) -> FloatArray:
 
 
 def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: float) -> FloatArray:
-    """``values`` at rest before, joined by straight lines, through a continuous filter: exactly."""
+    """Return ``values``, at rest before and joined by lines, through a continuous filter."""
     numerator, denominator, _ = signal.cont2discrete(ratio, step, method="foh")
     return np.asarray(signal.lfilter(numerator.ravel(), denominator, values))
 
 
 def hardened(linear: FloatArray, scale: float) -> FloatArray:
-    """Deflection δ of a spring whose stiffness is ``1 + (δ/scale)²`` times the ``linear`` one's.
+    """Return δ of a spring whose stiffness is ``1 + (δ/scale)²`` times the ``linear`` one's.
 
     The real root of ``δ + δ³/scale² = linear`` [m].
     """

@@ -27,7 +27,7 @@ class Trajectory:
         return self.start + np.arange(len(self.values), dtype=np.float64) * self.step
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Value at ``time`` [s], of its shape: itself on the grid, a cubic through four beside it.
+        """Return the value at ``time`` [s], of its shape: on the grid itself, else a cubic of four.
 
         Raises ConfigurationError for a time before the start or after the end.
         """
@@ -44,7 +44,7 @@ class Trajectory:
         return self._between(place)
 
     def _between(self, place: FloatArray) -> FloatArray:
-        """Lagrange's cubic through the two values before and the two after ``place`` [steps]."""
+        """Return Lagrange's cubic through two values before and two after ``place`` [steps]."""
         index = np.clip(np.floor(place).astype(np.int64), 1, len(self.values) - 3)
         u = place - index
         v, w, q = u + 1, u - 1, u - 2

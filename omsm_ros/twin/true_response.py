@@ -25,19 +25,19 @@ class TrueResponse:
     probe: Probe
 
     def response(self, frequency: ArrayLike) -> ComplexArray:
-        """G at ``frequency`` [Hz], of its shape, with a gain of 1 at rest."""
+        """Return G at ``frequency`` [Hz], of its shape, with a gain of 1 at rest."""
         f = np.asarray(frequency, np.float64)
         return self.structural_response(f) * self.probe_response(f)
 
     def structural_response(self, frequency: ArrayLike) -> ComplexArray:
-        """The part by which only Z is late, of the shape of ``frequency`` [Hz]."""
+        """Return the part by which only Z is late, of the shape of ``frequency`` [Hz]."""
         s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
         moved = self.plant_dynamics.normalised().at(s) * self.disturbances.structure.response(s)
         seen = self.disturbances.encoder.response(s) / self._encoder_gain
         return np.asarray(moved / seen, np.complex128)
 
     def probe_response(self, frequency: ArrayLike) -> ComplexArray:
-        """The part by which the reading is late, so X and C too, of ``frequency`` [Hz]."""
+        """Return the part by which the reading is late, so X and C too, of ``frequency`` [Hz]."""
         f = np.asarray(frequency, np.float64)
         turning = np.exp(-2j * np.pi * f * self.latency_s)
         return np.asarray(turning * np.sinc(f * self.disturbances.probe.window_s), np.complex128)

@@ -21,7 +21,7 @@ class Departure:
 
 
 def spread(error: FloatArray, weight: FloatArray | None = None) -> Departure:
-    """Departure of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
+    """Return the departure of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
     if not len(error):
         raise DataError("no points to compare with the truth")
     return Departure(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))

@@ -38,13 +38,13 @@ class VibrationLine:
             )
 
     def height(self, time: FloatArray, c: FloatArray, random_phase: float) -> FloatArray:
-        """Height [m] at ``time`` (n,) [s] and spindle angle ``c`` (n,) [rad]."""
+        """Return the height [m] at ``time`` (n,) [s] and spindle angle ``c`` (n,) [rad]."""
         phase = random_phase if self.phase_rad is None else self.phase_rad
         turning = 2 * np.pi * self.frequency_hz * time + self.per_turn * c + phase
         return np.asarray(self.amplitude_m * np.sin(turning), np.float64)
 
     def turn(self, duration_s: float, spindle_rad: FloatArray) -> FloatArray:
-        """How far its phase turns [rad] in a time in which the spindle turns by so much (n,)."""
+        """Return how far its phase turns [rad] while the spindle turns by so much (n,)."""
         return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
 
 
@@ -57,7 +57,7 @@ class Vibration:
 
     @classmethod
     def of(cls, lines: Sequence[VibrationLine], random: np.random.Generator) -> Vibration:
-        """The lines with phases by ``random`` where none is given."""
+        """Return the lines with phases by ``random`` where none is given."""
         return cls(lines, random.uniform(0.0, 2 * np.pi, len(lines)).tolist())
 
     def height(
@@ -75,7 +75,7 @@ class Vibration:
         return total
 
     def acceleration(self, time: FloatArray, c: FloatArray, spindle: FloatArray) -> FloatArray:
-        """Second derivative of the height [m/s²] at speeds ``spindle`` (n,) [rad/s]."""
+        """Return the second derivative of the height [m/s²] at speeds ``spindle`` (n,) [rad/s]."""
         total = np.zeros_like(time)
         for line, phase in zip(self.lines, self.phases, strict=True):
             total -= line.turn(1.0, spindle) ** 2 * line.height(time, c, phase)

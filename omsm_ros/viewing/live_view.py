@@ -199,7 +199,7 @@ def _grid_entry(grid: Grid) -> dict[str, float]:
 
 
 def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[str, Any]:
-    """The worst of three: the nodes' states, the calibration, and what the corrector measures.
+    """Return the worst of: states of nodes, calibration, and what the corrector measures.
 
     Green only if every node is well, the calibration was accepted without reservation, and the
     light of the measurement, which a corrector reports, is green too.
@@ -221,12 +221,12 @@ def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[
 
 
 def _is_rejected(calibration: Mapping[str, Any]) -> bool:
-    """Whether the calibration in force was rejected."""
+    """Return whether the calibration in force was rejected."""
     return bool(calibration.get("verdict") == REJECTED)
 
 
 def _against(calibration: Mapping[str, Any]) -> str:
-    """What speaks against the calibration in force; empty if nothing does."""
+    """Return what speaks against the calibration in force; empty if nothing does."""
     if not calibration:
         return "no calibration yet"
     verdict = str(calibration["verdict"])

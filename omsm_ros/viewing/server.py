@@ -81,7 +81,7 @@ class LiveServer:
     # ------------------------------------------------------------------------- requests
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page, a refusal, or None where the socket may be opened."""
+        """Return the page, a refusal, or None where the socket may be opened."""
         place = urlsplit(request.path)
         given = parse_qs(place.query).get("token", [""])[0]
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
@@ -95,7 +95,7 @@ class LiveServer:
         return _text(http.HTTPStatus.NOT_FOUND, "there is only /\n")
 
     def _from_here(self, request: Request) -> bool:
-        """Whether no page of another origin asks, and the name is one of this computer's.
+        """Return whether no page of another origin asks, and the name is one of this computer's.
 
         A browser sends the page's origin with a socket's request; a foreign name that points here
         (DNS rebinding) stands in Host.

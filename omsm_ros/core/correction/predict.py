@@ -165,7 +165,7 @@ def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
 
 
 def _what_could_hide(calibration: Calibration, hidden: float) -> str:
-    """Name the part of the residual that the step test could not have shown."""
+    """Return the name the part of the residual that the step test could not have shown."""
     mostly = calibration.certificate.get("hidden_mostly")
     if hidden == 0 or not isinstance(mostly, str):
         return ""

@@ -28,7 +28,7 @@ class Conformity:
     tolerance: float
 
     def entry(self) -> dict[str, Any]:
-        """For result files: JSON values."""
+        """Return the JSON values for result files."""
         return asdict(self)
 
 

@@ -104,13 +104,13 @@ class SphereScanReader:
         self._axes = [b for b in self._axes if b.end > last]
 
     def scan(self) -> SphereScan:
-        """The points kept."""
+        """Return the points kept."""
         rows = self._kept.rows().reshape(-1, len(_COLUMNS))
         return SphereScan(**dict(zip(_COLUMNS, rows.T, strict=True)))
 
 
 def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
-    """The scan behind points that were corrected with no geometry and no lateral lag.
+    """Return the scan behind points that were corrected with no geometry and no lateral lag.
 
     axes: the blocks of that one scan. Raises DataError for a point that is in none of them.
     """
@@ -191,7 +191,7 @@ def _fitted(
 
 
 def _rms(found: optimize.OptimizeResult) -> float:
-    """Of the distances of the points from the sphere [m]."""
+    """Return the rms distance of the points from the sphere [m]."""
     return float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
 
 
@@ -227,7 +227,7 @@ def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:
 
 
 def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatArray) -> FloatArray:
-    """Distances of the points from the sphere [µm], (n,)."""
+    """Return the distances of the points from the sphere [µm], (n,)."""
     points = workpiece_points(
         _with(geometry, unknown), (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance
     )
@@ -239,7 +239,7 @@ def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatA
 
 
 def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
-    """Derivatives of :func:`_misfit` (n, 5 or 7).
+    """Return the derivatives of :func:`_misfit` (n, 5 or 7).
 
     Analytic in the centres: on a sphere that runs true, an offset across the feed shows in
     second order only, and the rounding of differences would pass for knowledge of it.
@@ -267,7 +267,7 @@ def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> Floa
 
 
 def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool) -> FloatArray:
-    """The sphere's centre one radius off the lowest or highest of a fitted paraboloid."""
+    """Return the sphere's centre one radius off the lowest or highest of a fitted paraboloid."""
     points = workpiece_points(geometry, (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance)
     ones = np.ones(len(points.x))
     terms = np.stack([ones, points.x, points.y, points.x**2 + points.y**2], axis=1)
@@ -279,7 +279,7 @@ def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool
 
 
 def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """From residuals that may be correlated within groups of consecutive points."""
+    """Return the standard uncertainties, residuals taken as correlated within groups of points."""
     # Through the singular values of scaled columns: the normal equations would square the
     # condition number, and with it lose what is barely known.
     unit, scale = unit_columns(jacobian)

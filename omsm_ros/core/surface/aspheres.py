@@ -64,7 +64,7 @@ class Asphere:
         checked_terms(self.odd_terms, "odd_terms")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN where the conic has ended."""
+        """Return the height [m] at x, y [m]; NaN where the conic has ended."""
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
         height = c * s / (1 + root_of(1 - (1 + self.conic_constant) * c**2 * s))
         if self.even_terms:
@@ -74,7 +74,7 @@ class Asphere:
         return np.asarray(height, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]; zero at the tip of a cone, which has none."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]; zero at the tip of a cone, which has none."""
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
         # Of dz/dr over r, so that nothing is divided at the centre.
         each = c / root_of(1 - (1 + self.conic_constant) * c**2 * s)
@@ -109,13 +109,13 @@ class Toroid:
         CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN beyond the tube."""
+        """Return the height [m] at x, y [m]; NaN beyond the tube."""
         profile, _ = self._profile(y)
         square = profile * (2 * self.radius_x - profile) + np.square(x)
         return np.asarray(square / (self.radius_x + self._root(x, profile)), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         profile, slope = self._profile(y)
         root = self._root(x, profile)
         return np.asarray(x / root), np.asarray((self.radius_x - profile) * slope / root)
@@ -153,12 +153,12 @@ class Biconic:
             CONIC_CONSTANT.checked(getattr(self, name), SurfaceError, name)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN where the conics have ended."""
+        """Return the height [m] at x, y [m]; NaN where the conics have ended."""
         bent, root, _, _ = self._parts(x, y)
         return np.asarray(bent / (1 + root), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         bent, root, p, q = self._parts(x, y)
         share = bent / ((1 + root) ** 2 * root)
         cx, cy = curvature_of(self.radius_x), curvature_of(self.radius_y)

@@ -59,7 +59,7 @@ class Profile:
 
 
 def deviation(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> FloatArray:
-    """Height minus nominal height [m] at x, y [m], each (n,), in the frame of the surface.
+    """Return height minus nominal height [m] at x, y [m], each (n,), in the frame of the surface.
 
     Raises DataError where the cloud is not finite or reaches beyond the nominal surface.
     """
@@ -82,7 +82,7 @@ def level(
     tilt: bool = False,
     weights: FloatArray | None = None,
 ) -> FloatArray:
-    """Deviation (n,) [m] without its least-squares piston, and without tilt if asked for.
+    """Return deviation (n,) [m] without its least-squares piston, and without tilt if asked for.
 
     A piston is the unknown stand-off of the probe; remove a tilt only where the part's
     seat on the spindle is not of interest. ``weights`` (n,) as for :func:`statistics`.
@@ -96,7 +96,7 @@ def level(
 
 
 def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
-    """Figures of a deviation (n,) [m] whose points stand for areas ∝ ``weights`` (n,).
+    """Return the figures of a deviation (n,) [m] whose points stand for areas ∝ ``weights`` (n,).
 
     Raises DataError for values that are not finite or weights that are not areas.
     """
@@ -144,7 +144,7 @@ class RunningStatistics:
         self._weighed.add(np.stack([x, y, shifted], axis=1))
 
     def statistics(self) -> FormStatistics:
-        """Of all portions so far. Raises DataError if there was none."""
+        """Return the statistics of all portions so far. Raises DataError if there was none."""
         if not self._points:
             raise DataError("0 points: there is nothing to take statistics of")
         x, y, shifted = self._weighed.rows().T
@@ -168,7 +168,7 @@ def line_profile(
     half_width: float,
     spacing: float,
 ) -> Profile:
-    """Profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
+    """Return the profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
 
     Points up to ``half_width`` [m] beside the line are averaged over every ``spacing`` [m].
     """
@@ -182,7 +182,7 @@ def line_profile(
 def radial_profile(
     x: FloatArray, y: FloatArray, deviation: FloatArray, *, spacing: float
 ) -> Profile:
-    """Mean over rings of width ``spacing`` [m] about the origin: what a turned part repeats.
+    """Return mean over rings of width ``spacing`` [m] about the origin: what a turned part repeats.
 
     Each of 12 directions counts alike, and a ring that was not seen in all of them is left
     out: over a part of a turn the errors of the other orders would not average to zero.

@@ -54,11 +54,11 @@ class XYPolynomial:
         DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]."""
+        """Return the height [m] at x, y [m]."""
         return self._at(x, y, self._coefficients())
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         along_x, along_y = (
             np.asarray(polyder(self._coefficients(), axis=k) / self.radius, np.float64)
             for k in range(2)
@@ -109,14 +109,14 @@ class ZernikeSurface:
             TERM_SIZE.checked(value, SurfaceError, f"coefficients[{place}]")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]."""
+        """Return the height [m] at x, y [m]."""
         u, v = self._on_the_disc(x, y)
         terms, sizes = self._terms()
         made = sizes @ zernike_values(u.ravel(), v.ravel(), terms) if terms else np.zeros(u.size)
         return np.asarray(made.reshape(u.shape), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         u, v = self._on_the_disc(x, y)
         terms, sizes = self._terms()
         if not terms:
@@ -157,12 +157,12 @@ class QBfs:
         _check_series(self.aperture_radius, self.radius, self.coefficients)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN beyond the sphere's equator."""
+        """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
         height, _ = self._by_square(np.square(x) + np.square(y))
         return height
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         _, rate = self._by_square(np.square(x) + np.square(y))
         return np.asarray(2 * rate * x), np.asarray(2 * rate * y)
 
@@ -197,13 +197,13 @@ class QCon:
         CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN where the conic has ended."""
+        """Return the height [m] at x, y [m]; NaN where the conic has ended."""
         u = (np.square(x) + np.square(y)) / self.aperture_radius**2
         bump, _ = con_series(self.coefficients, u)
         return np.asarray(self._conic().height(x, y) + u**2 * bump)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         area = self.aperture_radius**2
         u = (np.square(x) + np.square(y)) / area
         bump, slope = con_series(self.coefficients, u)

@@ -108,11 +108,11 @@ class GridSurface:
         self._spline = RectBivariateSpline(grid.y, grid.x, filled)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN where the map has none."""
+        """Return the height [m] at x, y [m]; NaN where the map has none."""
         return self._at(x, y, 0, 0)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         return self._at(x, y, 1, 0), self._at(x, y, 0, 1)
 
     def _at(self, x: FloatArray, y: FloatArray, dx: int, dy: int) -> FloatArray:

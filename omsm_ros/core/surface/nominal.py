@@ -31,11 +31,11 @@ class Flat:
         LENGTH.checked(self.level, SurfaceError, "level")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]."""
+        """Return the height [m] at x, y [m]."""
         return np.full(np.broadcast(x, y).shape, self.level)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         zero = np.zeros(np.broadcast(x, y).shape)
         return zero, zero
 
@@ -50,14 +50,14 @@ class Sphere:
         RADIUS.checked(self.radius, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m]; NaN outside the sphere's equator."""
+        """Return the height [m]; NaN outside the sphere's equator."""
         square = np.asarray(x) ** 2 + np.asarray(y) ** 2
         root = np.sqrt(np.maximum(self.radius**2 - square, 0.0))
         sag = np.sign(self.radius) * square / (abs(self.radius) + root)
         return np.where(square <= self.radius**2, sag, np.nan)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
         return Asphere(self.radius).gradient(x, y)
 
 
@@ -81,13 +81,13 @@ class OffAxisParaboloid:
         LENGTH.checked(self.off_axis_distance, SurfaceError, "off_axis_distance")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]."""
+        """Return the height [m] at x, y [m]."""
         b, c, root, _ = self._quadratic(x, y)
         # 2c / (b + √…) is the small root without the cancellation of (b - √…) / 2a.
         return np.asarray(2 * c / (b + root), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]: of ``a w² − b w + c = 0``, differentiated."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]: of ``a w² − b w + c = 0``, differentiated."""
         b, c, root, slope = self._quadratic(x, y)
         q2 = 1 + slope**2
         w = 2 * c / (b + root)

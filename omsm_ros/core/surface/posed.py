@@ -87,13 +87,13 @@ class PosedSurface:
     pose: Pose
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m] of the machine; NaN where the surface has none."""
+        """Return the height [m] at x, y [m] of the machine; NaN where the surface has none."""
         pose = self.pose
         found = _intersected(self.surface, pose.rotation, np.asarray(x) - pose.x, y - pose.y)
         return np.asarray(found[2] + pose.piston)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         pose = self.pose
         moved = (np.asarray(x) - pose.x, np.asarray(y) - pose.y)
         return _turned_slopes(
@@ -137,11 +137,11 @@ class OffAxisSection:
         object.__setattr__(self, "_frame", frame)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN where the parent has none."""
+        """Return the height [m] at x, y [m]; NaN where the parent has none."""
         return _intersected(self.parent, self._frame, x, y, self._centre)[2]
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         found = _intersected(self.parent, self._frame, x, y, self._centre)
         return _turned_slopes(self.parent, self._frame, found)
 
@@ -199,11 +199,11 @@ class Sum:
             raise SurfaceError("a sum of no parts is no surface; name at least one")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]."""
+        """Return the height [m] at x, y [m]."""
         return np.asarray(sum(part.height(x, y) for part in self.parts), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         along_x, along_y = gradient_of(self.parts[0], x, y)
         for part in self.parts[1:]:
             more = gradient_of(part, x, y)

@@ -23,11 +23,11 @@ class SlopedSurface(Protocol):
     """A surface that knows its slopes in closed form."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m], of their broadcast shape."""
+        """Return the height [m] at x, y [m], of their broadcast shape."""
         ...
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1] at x, y [m]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1] at x, y [m]."""
         ...
 
 

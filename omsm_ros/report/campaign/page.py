@@ -118,7 +118,7 @@ def _value(measurement: Measurement, series: Series) -> float:
 
 
 def _times(measurements: Sequence[Measurement]) -> FloatArray:
-    """Seconds of each recording, NaN where it does not tell."""
+    """Return the time of each recording [s], NaN where it has none."""
     unknown = np.nan
     return np.array(
         [
@@ -168,7 +168,7 @@ def _date(stamp_ns: int | None) -> str:
 
 
 def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> bytes:
-    """Each series over time, or over the order of names where no time is known."""
+    """Return each series over time, or over the order of names where no time is known."""
     times = _times(measurements)
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
     x = (times - np.nanmin(times)) / _DAY_S if timed else np.arange(len(measurements))

@@ -38,7 +38,7 @@ _BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
 
 
 def response_with_band(calibration: Calibration, seen: FrequencyResponse | None = None) -> Figure:
-    """Bode plot with its 95 % band, and the points of an estimate without a model."""
+    """Return Bode plot with its 95 % band, and the points of an estimate without a model."""
     made = bode(calibration, None, calibration.sample_period)
     made.set_size_inches(7.4, 5.45)
     gain, phase, _ = made.get_axes()
@@ -72,7 +72,7 @@ def _draw_points(gain: Axes, phase: Axes, seen: FrequencyResponse) -> None:
 
 
 def thinned(seen: FrequencyResponse) -> FrequencyResponse:
-    """Coherent lines above zero frequency, those close together averaged by their weight."""
+    """Return coherent lines above zero frequency, those close together averaged by their weight."""
     good = (seen.frequency > 0) & (seen.coherence > _COHERENT)
     frequency = seen.frequency[good]
     group = np.floor(_POINTS_PER_DECADE * np.log10(np.maximum(frequency, 1e-12)))
@@ -136,7 +136,7 @@ def _draw_at_edges(axes: Axes, mean: EdgeMean, noise: float | None) -> None:
 
 
 def draw_correlation(axes: Axes, left: FloatArray) -> None:
-    """Correlation of ``left`` (n,) with itself, NaN left out, and the bound of white noise."""
+    """Draw the correlation of ``left`` (n,) with itself, without NaN, and white noise's bound."""
     lags = np.arange(1, _LAGS + 1)
     bound = COVERAGE_FACTOR / np.sqrt(max(int(np.sum(np.isfinite(left))), 1))
     axes.axhspan(-bound, bound, label="95 % if white", **_SPAN)
@@ -182,7 +182,7 @@ def _draw_candidates(
 
 
 def _plain_log(axes: Axes) -> None:
-    """A logarithmic axis labelled 1, 2, 5, 10."""
+    """Label a logarithmic axis 1, 2, 5, 10."""
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -23,18 +23,18 @@ _SPECIAL = re.compile(r"([\\`*_{}\[\]#|~!$])")
 
 
 def picture_name(figure: str) -> str:
-    """File that holds ``figure`` beside the Markdown."""
+    """Return the file that holds ``figure`` beside the Markdown."""
     return f"certificate_{figure}.png"
 
 
 def text(value: str) -> str:
-    """``value`` on one line, every sign of it shown as it is."""
+    """Return ``value`` on one line, every sign of it shown as it is."""
     one_line = html.escape(" ".join(value.split(" ")), quote=False).splitlines()
     return _SPECIAL.sub(r"\\\1", " ".join(one_line))
 
 
 def render_markdown(certificate: CertificatePage) -> str:
-    """The page as Markdown (tables as GitHub writes them); all text from outside is escaped."""
+    """Return the page as Markdown with GitHub's tables; all text from outside is escaped."""
     return "\n".join(_lines(certificate)).rstrip() + "\n"
 
 

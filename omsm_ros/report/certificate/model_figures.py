@@ -23,7 +23,7 @@ _SPAN: dict[str, Any] = {"color": style.AFTER, "alpha": 0.22, "linewidth": 0, "l
 
 
 def response(model: SampledModel) -> Figure:
-    """Gain and phase up to half the sampling rate with their 95 % band; grey: not trusted."""
+    """Draw gain and phase to half the sampling rate with their 95 % band; grey: not trusted."""
     frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sample_period
     value, band = response_of(model, frequency)
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
@@ -51,7 +51,7 @@ def response(model: SampledModel) -> Figure:
 
 
 def response_of(model: SampledModel, frequency: FloatArray) -> tuple[ComplexArray, Band]:
-    """Response of the model at ``frequency`` (k,) [Hz], and its band."""
+    """Return the response of the model at ``frequency`` (k,) [Hz], and its band."""
     if model.discrete is not None:
         period = model.sample_period
         return model.discrete.response(frequency, period), model.discrete.band(frequency, period)
@@ -87,7 +87,7 @@ def _draw(axes: Axes, time: FloatArray, value: FloatArray, colour: str, label: s
 
 
 def correlation(run: FreeRun) -> Figure:
-    """Autocorrelation of the residual."""
+    """Draw the autocorrelation of the residual."""
     made, axes = style.figure(7.4, 2.6)
     draw_correlation(axes[0, 0], run.residual)
     return made

@@ -63,7 +63,7 @@ class ModelPage:
 def model_figures_of(
     model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun
 ) -> dict[str, bytes]:
-    """PNG files for the page."""
+    """Return PNG files for the page."""
     made = {
         BAND: drawn.response(model),
         RECORD: drawn.record(model, input, output, run),
@@ -73,7 +73,7 @@ def model_figures_of(
 
 
 def render_model(page: ModelPage) -> str:
-    """The page as HTML; all text from outside is escaped."""
+    """Return the page as HTML; all text from outside is escaped."""
     return fill(
         "certificate.html",
         heading="Model",
@@ -90,7 +90,7 @@ def render_model(page: ModelPage) -> str:
 
 
 def verdict_on_model(model: SampledModel) -> Verdict:
-    """The model's own verdict, and why."""
+    """Return the model's own verdict, and why."""
     stated = str(model.certificate.get("verdict", ""))
     reasons, warnings = (texts(model.certificate, name) for name in ("reasons", "warnings"))
     if stated == REJECTED:

@@ -75,7 +75,7 @@ class Section:
 
 
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
-    """PNG files for the page."""
+    """Return PNG files for the page."""
     certificate = calibration.certificate
     made = {
         BAND: certificate_figures.response_with_band(calibration, fitted.measured),
@@ -96,12 +96,12 @@ def _comparable(candidate: Mapping[str, object]) -> bool:
 
 
 def _bridged(fitted: FittedRecord) -> FloatArray:
-    """Matplotlib leaves gaps at NaN by itself; the median that aligns an edge does not."""
+    """Return ``values`` as they are: Matplotlib leaves gaps at NaN, an edge's median does not."""
     return np.asarray(np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled))
 
 
 def render(certificate: CertificatePage) -> str:
-    """The page as HTML; all text from outside is escaped."""
+    """Return the page as HTML; all text from outside is escaped."""
     return fill(
         "certificate.html",
         heading="Calibration certificate",
@@ -124,7 +124,7 @@ def issued(certificate: CertificatePage) -> str:
 
 
 def verdict_on_calibration(calibration: Calibration) -> Verdict:
-    """The certificate's own verdict, and why."""
+    """Return the certificate's own verdict, and why."""
     stated, reasons = verdict_of(calibration)
     if stated == REJECTED:
         return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
@@ -156,7 +156,7 @@ def _grounds(calibration: Calibration) -> list[str]:
 
 
 def _band_text(calibration: Calibration) -> str:
-    """Greatest half-width of the 95 % band below ``valid_up_to``."""
+    """Return the greatest half-width of the 95 % band below ``valid_up_to``."""
     at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
     band = response_band(calibration.dynamics, calibration.covariance, at)
     gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
@@ -164,7 +164,7 @@ def _band_text(calibration: Calibration) -> str:
 
 
 def headlines(calibration: Calibration) -> list[Headline]:
-    """The numbers that a reader looks for first, those that are known."""
+    """Return the numbers that a reader looks for first, those that are known."""
     return [h for h in _all_headlines(calibration) if h.value != NOTHING]
 
 
@@ -238,7 +238,7 @@ def _departures(entries: tables.CertificateEntries) -> Section:
 
 
 def sections(certificate: CertificatePage) -> list[Section]:
-    """All parts below the first screen that have anything to show."""
+    """Return all parts below the first screen that have anything to show."""
     calibration = certificate.calibration
     entries = calibration.certificate
     warnings = [(text,) for text in tables.texts(entries, "warnings")]

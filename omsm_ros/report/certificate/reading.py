@@ -14,7 +14,7 @@ from omsm_ros.units import MILLISECOND_S
 
 
 def mode_table(calibration: Calibration) -> Table:
-    """The poles as terms of Eq. 8, and whether the band reaches them."""
+    """Return the poles as terms of Eq. 8, and whether the band reaches them."""
     modes = known_modes(calibration.dynamics, calibration.covariance)
     rows = [
         (
@@ -30,7 +30,7 @@ def mode_table(calibration: Calibration) -> Table:
 
 
 def _oscillation(mode: KnownMode) -> tuple[str, str]:
-    """Damping and residue."""
+    """Return the damping and residue."""
     if mode.residue is None or mode.residue_uncertainty is None:
         return "1, by definition", "none"
     residue, spread = (v * MILLISECOND_S**2 for v in (mode.residue, mode.residue_uncertainty))
@@ -49,7 +49,7 @@ _PROBE_ON = {False: "second mass, not the driven one (Eq. 7)", True: "driven mas
 
 
 def two_mass_table(certificate: CertificateEntries) -> Table:
-    """Masses, springs and dampers, or each per mass of the table where that is not known."""
+    """Return masses, springs and dampers, or each per mass of the table where that is not known."""
     model: Mapping[str, Any] = part(certificate, "two_mass", "model") or {}
     absolute = number(part(certificate, "two_mass", "table_mass_kg")) is not None
     rows = []
@@ -78,7 +78,7 @@ _SHAPE_ROWS = (
 
 
 def shape_table(calibration: Calibration) -> Table:
-    """What stands out in the identified response, and whether the band reaches it."""
+    """Return what stands out in the identified response, and whether the band reaches it."""
     certificate, trusted = calibration.certificate, calibration.valid_up_to
     rows = [
         (name, _point(certificate, place, gain), _reached(certificate, place, trusted))

@@ -36,19 +36,19 @@ CertificateEntries = Mapping[str, Any]
 
 
 def listed(certificate: CertificateEntries, name: str) -> list[Mapping[str, Any]]:
-    """The mappings in a list of the certificate; none if there is no such list."""
+    """Return the mappings in a list of the certificate; none if there is no such list."""
     entries = certificate.get(name)
     return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
 
 def texts(certificate: CertificateEntries, name: str) -> list[str]:
-    """The texts of a list of the certificate."""
+    """Return the texts of a list of the certificate."""
     entries = certificate.get(name)
     return [str(entry) for entry in entries] if isinstance(entries, list) else []
 
 
 def structure_text(structure: Mapping[str, Any]) -> str:
-    """``2 poles, 1 zero, no delay``."""
+    """Return ``2 poles, 1 zero, no delay``."""
     counts = [(structure.get("poles"), "pole"), (structure.get("zeros"), "zero")]
     parts = [f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts if isinstance(n, int)]
     if isinstance(structure.get("delay"), bool):
@@ -57,7 +57,7 @@ def structure_text(structure: Mapping[str, Any]) -> str:
 
 
 def own_structure(calibration: Calibration) -> dict[str, object]:
-    """Structure of the coefficients themselves, whatever the certificate says of it."""
+    """Return the structure of the coefficients themselves, whatever the certificate says of it."""
     dynamics = calibration.dynamics
     return {
         "poles": len(dynamics.denominator) - 1,
@@ -67,7 +67,7 @@ def own_structure(calibration: Calibration) -> dict[str, object]:
 
 
 def residual_table(certificate: CertificateEntries) -> Table:
-    """Does the model leave anything that it should have explained?"""
+    """Return what the model leaves that it should have explained, if anything."""
     white, free = (number(certificate.get(f"{n}_p")) for n in ("whiteness", "independence"))
     rows = [
         (
@@ -107,7 +107,7 @@ def _in_words(p: float | None, good: str, bad: str) -> str:
 
 
 def order_table(certificate: CertificateEntries) -> Table:
-    """Every structure that was tried."""
+    """Return every structure that was tried."""
     candidates = sorted(listed(certificate, "candidates"), key=structure_text)
     scores = [number(c.get("bic")) for c in candidates]
     least = min((s for s in scores if s is not None), default=0.0)
@@ -132,7 +132,7 @@ def _remark(candidate: Mapping[str, Any], lowest: bool, certificate: Certificate
 
 
 def is_chosen(candidate: Mapping[str, Any], certificate: CertificateEntries) -> bool:
-    """True for the candidate whose structure the certificate gives as its own."""
+    """Return True for the candidate whose structure the certificate gives as its own."""
     structure = certificate.get("structure")
     return isinstance(structure, Mapping) and all(
         candidate.get(key) == structure.get(key) for key in ("poles", "zeros", "delay")
@@ -147,7 +147,7 @@ _GAINS = {
 
 
 def gain_table(calibration: Calibration) -> Table:
-    """Static gains: the probe's scale, or the encoder's? And how far each is from 1."""
+    """Return the static gains: the probe's scale, or the encoder's? And how far each is from 1."""
     certificate = calibration.certificate
     spread = certificate.get("static_gain_uncertainty")
     rows = [_gain_row("probe per encoder, fitted", calibration.static_gain, spread)]
@@ -170,7 +170,7 @@ _POLARITIES = {1: "falls when Z rises", -1: "rises when Z rises"}
 
 
 def background_table(certificate: CertificateEntries) -> Table:
-    """What the probe saw besides the motion."""
+    """Return what the probe saw besides the motion."""
     polarity = certificate.get("polarity")
     rows = [
         ("drift", quantity(certificate.get("drift_m_s"), "m/s")),
@@ -190,7 +190,7 @@ def _or_none(value: object, unit: str) -> str:
 
 
 def departure_table(certificate: CertificateEntries) -> Table:
-    """What departs from a linear, steady response, and was modelled."""
+    """Return what departs from a linear, steady response, and was modelled."""
     rows = [
         (
             str(entry.get("family", NOTHING)),
@@ -207,7 +207,7 @@ def departure_table(certificate: CertificateEntries) -> Table:
 
 
 def consistency_table(certificate: CertificateEntries) -> Table:
-    """What differs between the parts of the test, the first less the second."""
+    """Return what differs between the parts of the test, the first less the second."""
     rows = [
         (
             str(entry.get("parts", NOTHING)),
@@ -229,7 +229,7 @@ def _ppm(value: object) -> float | None:
 
 
 def hidden_table(certificate: CertificateEntries) -> Table:
-    """What this very test would have missed, and what that costs on a scan."""
+    """Return what this very test would have missed, and what that costs on a scan."""
     rows = [
         (
             str(entry.get("family", NOTHING)),
@@ -259,7 +259,7 @@ def hidden_table(certificate: CertificateEntries) -> Table:
 
 
 def coefficient_table(calibration: Calibration) -> Table:
-    """G_m itself (Eq. 11), with standard uncertainties off the diagonal of the covariance."""
+    """Return G_m itself (Eq. 11), with standard uncertainties from the covariance's diagonal."""
     dynamics = calibration.dynamics
     spread = np.sqrt(np.diag(calibration.covariance))
     names = [_power("n", k) for k in range(len(dynamics.numerator))]
@@ -282,7 +282,7 @@ def _power(letter: str, k: int) -> str:
 
 
 def sample_account(certificate: CertificateEntries) -> Table:
-    """What became of every sample."""
+    """Return what became of every sample."""
     account = certificate.get("samples")
     rows = [
         (str(reason).replace("_", " "), count(value))
@@ -301,7 +301,7 @@ _LIMITS = (
 
 
 def limit_table(certificate: CertificateEntries) -> Table:
-    """What the verdict was measured against."""
+    """Return what the verdict was measured against."""
     rows = [
         (
             name,
@@ -317,7 +317,7 @@ def limit_table(certificate: CertificateEntries) -> Table:
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
-    """What the certificate is about."""
+    """Return what the certificate is about."""
     rows = [
         ("identity", calibration.id),
         ("schema", SCHEMA),
@@ -330,11 +330,11 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
 
 
 def further_table(certificate: CertificateEntries) -> Table:
-    """Entries that have no other place on the page."""
+    """Return the entries that have no other place on the page."""
     rest = {str(key): value for key, value in certificate.items() if key not in _SHOWN}
     return mapping_table("Further entries", rest)
 
 
 def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
-    """The rows that have something in ``column``."""
+    """Return the rows that have something in ``column``."""
     return [row for row in rows if row[column] != NOTHING]

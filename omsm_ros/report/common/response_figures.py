@@ -26,17 +26,17 @@ class HasResponse(Protocol):
     """Whatever can be asked for its response: a transfer function, the truth of the twin."""
 
     def response(self, frequency: FloatArray) -> ComplexArray:
-        """G at ``frequency`` (n,) [Hz]."""
+        """Return G at ``frequency`` (n,) [Hz]."""
         ...
 
 
 def frequencies(identified: Calibration) -> FloatArray:
-    """Frequencies of a Bode plot [Hz]: up to Nyquist's, for the data say nothing beyond."""
+    """Return frequencies of a Bode plot [Hz]: up to Nyquist's, for the data say nothing beyond."""
     return np.geomspace(_LOWEST_HZ, 0.5 / identified.sample_period, 600)
 
 
 def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
-    """Gain, phase, and the error of a motion before and after the correction.
+    """Return the gain, phase, and the error of a motion before and after the correction.
 
     true: the twin's G_m, drawn where known
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
@@ -60,7 +60,7 @@ def draw_gain(
     true: HasResponse | None,
     title: str = "",
 ) -> None:
-    """|G_m| with its 95 % band."""
+    """Draw |G_m| with its 95 % band."""
     magnitude = np.abs(identified.dynamics.response(frequency))
     band = np.exp(COVERAGE_FACTOR * _band(identified, frequency).gain)
     _draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
@@ -84,7 +84,7 @@ def draw_gain(
 def draw_phase(
     axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
 ) -> None:
-    """Phase of G_m [deg] with its 95 % band."""
+    """Draw the phase of G_m [deg] with its 95 % band."""
     angle = _phase(identified.dynamics, frequency)
     band = COVERAGE_FACTOR * _band(identified, frequency).phase / DEGREE_RAD
     _draw_band(axes, frequency, angle - band, angle, angle + band)
@@ -162,7 +162,7 @@ def step_response(
     probe: FloatArray,
     predicted: FloatArray | None = None,
 ) -> Figure:
-    """One of the steepest moves, an edge of a step test, and how far the probe is from it.
+    """Return one of the steepest moves, an edge of a step test, and how far the probe is from it.
 
     Each array is of shape (n,), positions in [m].
 

@@ -34,7 +34,7 @@ class StudyPage:
 
 
 def fill_study(page: StudyPage) -> str:
-    """The page as HTML; all text from outside is escaped."""
+    """Return the page as HTML; all text from outside is escaped."""
     sections = [_present(section, page.figures) for section in page.sections]
     return fill(
         "study.html",

@@ -36,7 +36,7 @@ FAST_PNG = {"compress_level": 4}
 
 
 def empty(width: float, height: float) -> Figure:
-    """A figure of ``width`` × ``height`` [inch] that no window will ever show."""
+    """Return a figure of ``width`` × ``height`` [inch] that no window will ever show."""
     made = Figure(figsize=(width, height), facecolor="white")
     FigureCanvasAgg(made)
     return made
@@ -45,7 +45,7 @@ def empty(width: float, height: float) -> Figure:
 def figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of ``width`` × ``height`` [inch] and its axes, shape (rows, columns).
+    """Return a figure of ``width`` × ``height`` [inch] and its axes, shape (rows, columns).
 
     options: of matplotlib's ``subplots``, such as ``sharex`` and ``height_ratios``
     """
@@ -69,7 +69,7 @@ def figure(
 
 
 def quiet(axes: Axes) -> None:
-    """Thin grey axes, a faint grid behind the data."""
+    """Make axes thin and grey, with a faint grid behind the data."""
     axes.tick_params(labelsize=TEXT_PT, colors=MUTED, labelcolor=INK, length=3, width=0.7)
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
@@ -80,7 +80,7 @@ def quiet(axes: Axes) -> None:
 
 
 def label(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
-    """Axis labels (with their units) and a title on the left."""
+    """Label the axes, with their units, and put a title on the left."""
     axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
     axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
     if title:
@@ -90,13 +90,13 @@ def label(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
 
 
 def legend_above(axes: Axes) -> None:
-    """A legend on the line of the title, where it covers no data."""
+    """Put a legend on the line of the title, where it covers no data."""
     entries = len(axes.get_legend_handles_labels()[0])
     legend(axes, loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=entries, columnspacing=1.4)
 
 
 def legend(axes: Axes, **options: Any) -> None:
-    """A legend without a frame around it."""
+    """Put a legend without a frame around it."""
     look: dict[str, Any] = {
         "fontsize": TEXT_PT,
         "labelcolor": INK,
@@ -112,14 +112,14 @@ Envelope = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelope:
-    """Time, smallest and largest value of each of ``columns`` stretches: no spike is lost."""
+    """Return time, least and largest value of each of ``columns`` stretches: no spike is lost."""
     cuts = np.linspace(0, len(value), min(columns, len(value)), endpoint=False)
     starts = np.unique(cuts.astype(np.int64))
     return time[starts], np.minimum.reduceat(value, starts), np.maximum.reduceat(value, starts)
 
 
 def png(made: Figure, dpi: int = FIGURE_DPI) -> bytes:
-    """The figure as a PNG file, the same bytes for the same figure."""
+    """Return the figure as a PNG file, the same bytes for the same figure."""
     buffer = io.BytesIO()
     made.savefig(
         buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs=dict(FAST_PNG)

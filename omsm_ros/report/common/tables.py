@@ -30,7 +30,7 @@ class Table:
 
 
 def part(mapping: Mapping[str, Any], *path: str) -> Any:
-    """What lies at ``path`` in nested mappings, None where it is missing."""
+    """Return what lies at ``path`` in nested mappings, None where it is missing."""
     found: Any = mapping
     for key in path:
         found = found.get(key) if isinstance(found, Mapping) else None
@@ -38,7 +38,7 @@ def part(mapping: Mapping[str, Any], *path: str) -> Any:
 
 
 def error_table(summary: Mapping[str, object]) -> Table:
-    """Deviation and dynamic error, before and after the correction."""
+    """Return the deviation and dynamic error, before and after the correction."""
     rows = []
     for key, name in _FIGURE_NAMES.items():
         both = [part(summary, "deviation", side, key) for side in ("raw", "corrected")]
@@ -60,7 +60,7 @@ def error_table(summary: Mapping[str, object]) -> Table:
 
 
 def budget_table(summary: Mapping[str, object]) -> Table:
-    """Every source of uncertainty, the largest first, and last those that nobody looked at."""
+    """Return every source of uncertainty, the largest first, those not evaluated last."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
     ordered = sorted(rows, key=lambda row: (row["status"] == _OPEN, -(row["height"] or 0.0)))
     return Table(
@@ -83,14 +83,14 @@ def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _sized(size: object, unit: str) -> str:
-    """A size in its unit; a share or a rate per radian has no prefix."""
+    """Return a size in its unit; a share or a rate per radian has no prefix."""
     if unit == "1":
         return plain(size) if size is not None else NOTHING
     return quantity(size, unit)
 
 
 def motion_table(summary: Mapping[str, object]) -> Table:
-    """Was the scan slow enough, and was H good enough for it?"""
+    """Return whether the scan was slow enough, and H good enough for it."""
     prediction: Mapping[str, Any] = part(summary, "prediction") or {}
     outside = prediction.get("outside_band_fraction")
     factor = prediction.get("speed_factor")
@@ -112,7 +112,7 @@ def motion_table(summary: Mapping[str, object]) -> Table:
 
 
 def sample_table(summary: Mapping[str, object]) -> Table:
-    """Where every sample of every stream went."""
+    """Return where every sample of every stream went."""
     streams: Mapping[str, Any] = part(summary, "samples") or {}
     reasons = dict.fromkeys(r for s in streams.values() for r in part(s, "counted") or {})
     rows = [("received", *(count(part(s, "received")) for s in streams.values()))]
@@ -126,7 +126,7 @@ def sample_table(summary: Mapping[str, object]) -> Table:
 
 
 def latency_text(calibration: Calibration) -> str:
-    """How much of the lag is latency, and who says so."""
+    """Return how much of the lag is latency, and who says so."""
     try:
         latency = latency_of(calibration)
     except CalibrationError:
@@ -137,7 +137,7 @@ def latency_text(calibration: Calibration) -> str:
 
 
 def calibration_table(calibration: Calibration) -> Table:
-    """What was identified and how well."""
+    """Return what was identified and how well."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
     gain = measured(calibration.static_gain, certificate.get("static_gain_uncertainty"), digits=6)
     delay = measured(
@@ -166,12 +166,12 @@ def calibration_table(calibration: Calibration) -> Table:
 
 
 def mapping_table(title: str, values: Mapping[str, object]) -> Table:
-    """Any mapping of JSON values, one row a key."""
+    """Return any mapping of JSON values, one row a key."""
     return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
 
 
 def remarks_table(calibration: Calibration) -> Table:
-    """What the identification has to say about its result."""
+    """Return what the identification has to say about its result."""
     certificate: Mapping[str, Any] = calibration.certificate
     remarks = [*(certificate.get("reasons") or ()), *(certificate.get("warnings") or ())]
     return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])

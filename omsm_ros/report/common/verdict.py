@@ -52,7 +52,7 @@ def verdict_on_measurement(
 
 
 def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> Verdict:
-    """The light of the measurement, amber at best where there are warnings."""
+    """Return the light of the measurement, amber at best where there are warnings."""
     level = {"green": "good", "amber": "care", "red": "bad"}[light["level"]]
     if warnings and level == "good":
         level = "care"
@@ -77,7 +77,7 @@ def _accounting(summary: Mapping[str, object]) -> list[str]:
 
 
 def _latency(calibration: Calibration | None) -> list[str]:
-    """What to do about a lag of which nobody knows whether X and C share it."""
+    """Return what to do about a lag of which nobody knows whether X and C share it."""
     if calibration is None or latency_of(calibration).resolved:
         return []
     lag = calibration.dynamics.low_frequency_delay

@@ -35,7 +35,7 @@ CAPTIONS = {
 
 
 def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -> str:
-    """The page as HTML; all text from outside is escaped.
+    """Return the page as HTML; all text from outside is escaped.
 
     facts: the content of ``difference.json``
     """
@@ -61,7 +61,7 @@ def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -
 
 
 def map_of(found: Comparison) -> EmbeddedMap:
-    """Maps of the difference, of E_n and of both measurements less the fitted freedoms."""
+    """Return maps of the difference, of E_n and of both measurements less the fitted freedoms."""
     matched, agreement = found.matched, found.agreement
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
 
@@ -78,7 +78,7 @@ def map_of(found: Comparison) -> EmbeddedMap:
 
 
 def headlines(facts: Mapping[str, Any]) -> list[Headline]:
-    """The numbers that a reader looks for first."""
+    """Return the numbers that a reader looks for first."""
     difference = facts["difference"]
     spread = difference["uncertainty"]
     found = [
@@ -101,7 +101,7 @@ def headlines(facts: Mapping[str, Any]) -> list[Headline]:
 
 
 def records(facts: Mapping[str, Any]) -> list[Table]:
-    """E_n, terms, what each brought, and how they were matched."""
+    """Return E_n, terms, what each brought, and how they were matched."""
     return [_numbers(facts), _terms(facts), _sides(facts), _matching(facts)]
 
 

@@ -14,7 +14,7 @@ _WIDTH_IN = 9.2
 
 
 def chirp(time: FloatArray, check: PathCheck, model_lag: FloatArray) -> Figure:
-    """Fig. 9b to d: error over time, its rms by band, lag by band; ``model_lag``: true [rad]."""
+    """Draw Fig. 9b to d: error over time, its rms and lag by band; ``model_lag``: true [rad]."""
     made, axes = style.figure(_WIDTH_IN, 8.0, 3, 1)
     for values, colour, name in (
         (check.error_before, style.BEFORE, "before"),

@@ -33,7 +33,7 @@ class ExperimentPage:
 
 
 def render(page: ExperimentPage) -> str:
-    """The page as HTML."""
+    """Return the page as HTML."""
     rows = [(row.name, row.paper, row.ours, row.remark) for row in page.rows]
     beside = Table("", ("the paper", "the twin", ""), rows)
     return fill_study(

@@ -67,13 +67,13 @@ def embedded(layers: Sequence[Layer]) -> EmbeddedMap:
 
 
 def script() -> str:
-    """The script of the maps."""
+    """Return the script of the maps."""
     folder = resources.files("omsm_ros.report") / "templates"
     return (folder / "surface_map.js").read_text(encoding="utf-8")
 
 
 def policy_of(text: str) -> str:
-    """What a content security policy calls this script, and no other."""
+    """Return what a content security policy calls this script, and no other."""
     return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'"
 
 
@@ -100,7 +100,7 @@ def _entry(layer: Layer) -> dict[str, object]:
 
 
 def _on_its_grid(layer: Layer) -> Raster:
-    """A pixel for each place of the layer's grid."""
+    """Return a pixel for each place of the layer's grid."""
     left, bottom = (float(values.min()) for values in (layer.x, layer.y))
     column, row = (
         np.round((values - least) / layer.pitch).astype(np.int64)
@@ -121,7 +121,7 @@ def _limits(low: float, high: float, symmetric: bool) -> list[float]:
 
 
 def _png(codes: np.ndarray) -> str:
-    """A picture whose red and green are the two bytes of each code, first row lowest."""
+    """Return a picture whose red and green are the two bytes of each code, first row lowest."""
     pixels = np.stack([codes >> 8, codes & 255, np.zeros_like(codes)], axis=2).astype(np.uint8)
     content = io.BytesIO()
     imsave(content, pixels, format="png", pil_kwargs=dict(style.FAST_PNG))

@@ -39,7 +39,7 @@ _BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
 
 
 def symmetric_limits(x: FloatArray, y: FloatArray, deviation: FloatArray) -> Limits:
-    """Colour limits ±v [m] that hold all but 0.2 % of the pixels of a map."""
+    """Return the colour limits ±v [m] that hold all but 0.2 % of the pixels of a map."""
     return _symmetric(rasterise(x, y, deviation))
 
 
@@ -59,7 +59,7 @@ def deviation_map(
     limits: Limits | None = None,
     quantity: str = "deviation",
 ) -> Figure:
-    """A deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
+    """Return a deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
 
     unit: "nm", "µm" or "mm"
     limits: smallest and largest colour [m]; None: see :func:`symmetric_limits`. Give two
@@ -117,7 +117,7 @@ def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
 def profile(
     raw: Profile, corrected: Profile, *, title: str, position: str, true: Profile | None = None
 ) -> Figure:
-    """One profile before and after the correction in µm, and below it what is left in nm.
+    """Return one profile before and after the correction in µm, and below it what is left in nm.
 
     position: name of the horizontal axis, drawn in mm
     true: the true deviation along the same line, where it is known
@@ -153,7 +153,7 @@ def dynamic_error(
     after: FloatArray | None = None,
     uncertainty: FloatArray | None = None,
 ) -> Figure:
-    """Dynamic error over the scan, each (n,) [m]: before in µm, and what is left of it in nm.
+    """Draw the dynamic error over the scan, each (n,) [m]: before in µm, and what is left in nm.
 
     time: [s];  after: true error that is left, known on the twin only
     uncertainty: standard uncertainty of the height, drawn as ±2u
@@ -192,7 +192,7 @@ def _draw_envelope(
 def error_histogram(
     before: FloatArray, after: FloatArray, weights: FloatArray, *, left: str = "after"
 ) -> Figure:
-    """Share of the area over the size of the error, before and after on one logarithmic axis.
+    """Draw the share of the area over the size of the error, before and after, on one log axis.
 
     before, after: errors (n,) [m];  weights: area of each point;  left: name of the second
     """
@@ -214,7 +214,7 @@ def error_histogram(
 
 
 def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
-    """Bars of ``terms``, each {n, m, value, uncertainty (k = 1)} [m]; piston and tilts left out."""
+    """Draw ``terms``, each {n, m, value, uncertainty (k = 1)} [m], without piston and tilts."""
     shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
     made, axes = style.figure(6.1, 3.7)
     ax = axes[0, 0]
@@ -238,7 +238,7 @@ def overview_figure(
     identified: Calibration,
     true: HasResponse | None = None,
 ) -> Figure:
-    """One wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
+    """Return one wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
 
     raw, corrected: deviations (n,) [m] at x, y [m]
     """

@@ -23,7 +23,7 @@ def surface_figures(
     true_height: FloatArray | None = None,
     true_error_left: FloatArray | None = None,
 ) -> dict[str, bytes]:
-    """PNG files of a cloud; without a nominal surface a map of the height and of the error.
+    """Return PNG files of a cloud; without a nominal surface a map of the height and of the error.
 
     true_height, true_error_left: of each point [m], (n,), known on the twin only
     """
@@ -132,7 +132,7 @@ def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, 
 
 
 def _feed(cloud: CloudView) -> float:
-    """Radius gained per turn of a spiral [m]; 0 where the cloud makes no turn."""
+    """Return the radius gained per turn of a spiral [m]; 0 where the cloud makes no turn."""
     turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
     return float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
 

@@ -103,7 +103,7 @@ class Headline:
 
 
 def render(report: Report) -> str:
-    """The page as HTML; all text from outside is escaped."""
+    """Return the page as HTML; all text from outside is escaped."""
     drawing = script() if report.map else ""
     return fill(
         "report.html",
@@ -122,7 +122,7 @@ def render(report: Report) -> str:
 
 
 def headlines(summary: Mapping[str, Any]) -> list[Headline]:
-    """The numbers that a reader looks for first, those that are known."""
+    """Return the numbers that a reader looks for first, those that are known."""
     found = []
     form = part(summary, "deviation", "corrected")
     if form:

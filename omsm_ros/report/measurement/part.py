@@ -29,7 +29,7 @@ _POSE_UNITS = {
 
 
 def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verdict | None:
-    """The deviation of the part, and whether it holds its tolerance; None without a nominal."""
+    """Return the part's deviation, and whether it holds its tolerance; None without a nominal."""
     deviation = part(form, "deviation")
     if deviation:
         told = [
@@ -59,14 +59,14 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
-    """A figure with its expanded uncertainty, k = 2."""
+    """Return a figure with its expanded uncertainty, k = 2."""
     text = expanded(figure["value"], figure.get("uncertainty"), "m")
     larger = "; its uncertainty is larger than the figure itself"
     return text + larger if text.startswith("at most") else text
 
 
 def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
-    """What is no longer in the deviation: pose, and what the surface does not determine."""
+    """Return what is no longer in the deviation: pose, and what the surface does not determine."""
     title, columns = "Taken out", ("value", "standard uncertainty")
     if not form:
         rows = []
@@ -119,7 +119,7 @@ def _size(value: Any, unit: str) -> str:
 
 
 def limits_table(summary: Mapping[str, Any]) -> Table:
-    """What bounds the speed of this motion, the tightest first."""
+    """Return what bounds the speed of this motion, the tightest first."""
     limits = sorted(
         part(summary, "prediction", "limits") or (), key=lambda limit: limit["speed_factor"]
     )
@@ -140,7 +140,7 @@ def _size_of(value: Any, unit: str) -> str:
 
 
 def provenance_table(summary: Mapping[str, Any]) -> Table:
-    """From which recording and by which calibration."""
+    """Return from which recording and by which calibration a result is."""
     admission = part(summary, "admission")
     rows = [
         ("recording", str(part(summary, "bag") or NOTHING)),

@@ -29,7 +29,7 @@ class Raster:
 
 
 def rasterise(x: FloatArray, y: FloatArray, value: FloatArray) -> Raster:
-    """Mean of ``value`` at x, y [m], each (n,), on at most 400 × 400 pixels.
+    """Return the mean of ``value`` at x, y [m], each (n,), on at most 400 × 400 pixels.
 
     A pixel between two tracks takes the weighted mean of its surroundings; a pixel
     farther from any point than the tracks are from each other stays NaN, so that
@@ -67,7 +67,7 @@ def _close_gaps(total: FloatArray, count: FloatArray) -> FloatArray:
 
 
 def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
-    """Pixels to the nearest filled one, exact up to the reach of a gap that is to be closed."""
+    """Return pixels to the nearest filled one, exact up to the reach of a gap to be closed."""
     within = 2
     while True:
         away = distances(filled, within)
@@ -79,7 +79,7 @@ def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
 
 
 def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
-    """Pixels to the nearest filled pixel of an image (rows, columns), at least one of which is.
+    """Return pixels to the nearest filled one of an image (rows, columns) that has one.
 
     First along the columns, then the least sum of squares over the columns beside. Exact where
     it is no more than ``within``, elsewhere never less than the truth.
@@ -98,13 +98,13 @@ def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
 
 
 def smoothed(image: FloatArray, sigma: float) -> FloatArray:
-    """The image under a Gaussian of ``sigma`` pixels, cut off at four of them; zero beyond."""
+    """Return the image under a Gaussian of ``sigma`` pixels, cut off at four; zero beyond."""
     rows, columns = (_gaussian(size, sigma) for size in image.shape)
     return np.asarray(rows @ image @ columns, np.float64)
 
 
 def _gaussian(size: int, sigma: float) -> FloatArray:
-    """Weights (size, size) of each pixel of a line for each other one."""
+    """Return the weights (size, size) of each pixel of a line for each other one."""
     cut = int(4 * sigma + 0.5)
     weights = np.exp(-0.5 * (np.arange(max(size, cut + 1)) / sigma) ** 2)
     weights[cut + 1 :] = 0.0

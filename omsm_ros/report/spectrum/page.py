@@ -35,7 +35,7 @@ class SpectrumPage:
 def drawn(
     scans: Sequence[tuple[StudiedScan, Sequence[Named], Density]], valid_up_to: float | None
 ) -> dict[str, bytes]:
-    """PNG files of all figures."""
+    """Return PNG files of all figures."""
     pairs = [(studied, named) for studied, named, _ in scans]
     spectra = [(studied.signal.name, motion) for studied, _, motion in scans]
     made = {
@@ -48,7 +48,7 @@ def drawn(
 
 
 def render(page: SpectrumPage) -> str:
-    """The page as HTML."""
+    """Return the page as HTML."""
     summary = page.summary
     scans = summary["scans"]
     return fill_study(

@@ -74,7 +74,7 @@ class TextTable(ForeignTable):
     # ------------------------------------------------------------------------- bytes → lines
 
     def _probed(self) -> str:
-        """How the file is encoded; FileError for what is no text."""
+        """Return how the file is encoded; FileError for what is no text."""
         with open_regular(self.path, FileError, "table") as stream:
             start = stream.read(_PROBED_BYTES)
         if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -91,7 +91,7 @@ class TextTable(ForeignTable):
         return "utf-8-sig"
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Pieces of lines, each with the number of its first, from 1."""
+        """Yield the pieces of lines, each with the number of its first, from 1."""
         number, rest = 1, ""
         raw = open_regular(self.path, FileError, "table")
         with io.TextIOWrapper(raw, self._encoding, "replace", newline=None) as stream:
@@ -114,7 +114,7 @@ class TextTable(ForeignTable):
         return line.split() if mark == " " else line.split(mark)
 
     def _named_cells(self, line: str) -> list[str]:
-        """Cells of the line of names, which alone may hold delimiters in quotes."""
+        """Return the cells of the line of names, which alone may hold delimiters in quotes."""
         cells = self._cells(line)
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
@@ -149,7 +149,7 @@ class TextTable(ForeignTable):
                 raise self._culprit(lines_with, rows) from None
 
     def _check_foot(self, lines: list[str], first_number: int) -> None:
-        """A line below the table, such as "mean;4.5", is no sample, though a number is in it."""
+        """Raise FileError for a line below the table, such as "mean;4.5", that is no sample."""
         known = {"", *(text.lower() for text in self._form.missing)}
         low = max(0, len(lines) - _FOOT_LINES)
         for number, line in enumerate(lines[low:], first_number + low):
@@ -163,7 +163,7 @@ class TextTable(ForeignTable):
                     )
 
     def _culprit(self, lines: list[tuple[int, str]], rows: _Rows) -> FileError:
-        """The first line that is no row of numbers, and what may be wrong with it."""
+        """Return the first line that is no row of numbers, and what may be wrong with it."""
         good, bad = 0, len(lines)  # lines[:good] are rows, lines[:bad] are not all
         while bad - good > 1:
             middle = (good + bad) // 2
@@ -259,7 +259,7 @@ class _Rows:
             return np.loadtxt(lines, converters=self._number, encoding="utf-8", **how)
 
     def _check_points(self, lines: list[str]) -> None:
-        """Among decimal commas a point groups thousands: 1.234 would become another number."""
+        """Raise FileError for points among decimal commas: 1.234 is another number there."""
         for line in lines:
             if "." in line:
                 cells = self._table.cells(line)
@@ -267,7 +267,7 @@ class _Rows:
                     raise ValueError
 
     def _number(self, text: str) -> float:
-        """A number of a table; an empty cell is a reading that is not there."""
+        """Return a number of a table; an empty cell is a reading that is not there."""
         text = text.strip().strip('"').strip()
         if not text or text.lower() in self._missing:
             return float("nan")

@@ -67,7 +67,7 @@ class ForeignBag:
 
 @lru_cache(maxsize=1)
 def _standard() -> Typestore:
-    """Types for bags that carry no definitions: sqlite3 before ROS 2 Iron."""
+    """Return the types for bags that carry no definitions: sqlite3 before ROS 2 Iron."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -150,7 +150,7 @@ class TopicTable(ForeignTable):
 
     @staticmethod
     def _is_of_others(found: Sequence[float | None], fields: Sequence[str]) -> bool:
-        """Whether a message holds nothing of what is wanted but its time."""
+        """Return whether a message holds nothing of what is wanted but its time."""
         pairs = zip(found, fields, strict=True)
         return not any(v is not None for v, f in pairs if f != LOG_TIME and not f.endswith("stamp"))
 
@@ -164,7 +164,7 @@ def _columns(names: Sequence[str], rows: list[list[float]]) -> dict[str, FloatAr
 
 
 def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
-    """Ways to the numbers of a message."""
+    """Yield the ways to the numbers of a message."""
     if deep > _DEEPEST:
         return
     labels = getattr(message, "name", None)
@@ -184,7 +184,7 @@ def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
 
 
 def _getter(field: str, kind: str) -> _Get | None:
-    """What takes ``field`` out of a message of type ``kind``; None for the time of its record."""
+    """Return what takes ``field`` out of a message of type ``kind``; None: time of its record."""
     if field == LOG_TIME:
         return None
     parts = [(name, mark) for name, mark in _PART.findall(field)]
@@ -203,7 +203,7 @@ def _getter(field: str, kind: str) -> _Get | None:
 
 
 def _within_range(message: Any) -> float:
-    """Range.msg: values below range_min or above range_max should be discarded."""
+    """Return a Range.msg's distance, NaN below range_min or above range_max, as it asks."""
     value = float(message.range)
     stated = message.max_range > message.min_range
     outside = stated and not message.min_range <= value <= message.max_range

@@ -163,7 +163,7 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv
 
 
 def _formats(columns: Mapping[str, NDArray[np.generic]]) -> list[str]:
-    """As many digits as each kind of number holds."""
+    """Return formats with as many digits as each kind of number holds."""
     return [
         "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
         for part in columns.values()

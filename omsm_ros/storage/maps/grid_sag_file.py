@@ -112,7 +112,7 @@ def write_grid_sag(path: Path, grid: HeightGrid) -> None:
 
 
 def _derivatives(grid: HeightGrid) -> tuple[FloatArray, ...]:
-    """Slopes and twist by central differences; zero where a neighbour is missing."""
+    """Return the slopes and twist by central differences; zero where a neighbour is missing."""
     slope_y, slope_x = np.gradient(grid.height, grid.dy, grid.dx)
     twist = np.gradient(slope_x, grid.dy, axis=0)
     return tuple(np.nan_to_num(part, nan=0.0) for part in (slope_x, slope_y, twist))

@@ -90,7 +90,7 @@ def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
 
 
 def _datx_scale(surface: Any, what: str) -> float:
-    """Metres in one unit of the heights."""
+    """Return the length of one unit of the heights [m]."""
     unit = np.ravel(surface.attrs["Unit"])[0]
     name = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
     if (metres := metres_in(name)) is not None:
@@ -102,7 +102,7 @@ def _datx_scale(surface: Any, what: str) -> float:
 
 
 def _pixel(surface: Any, key: str, what: str) -> float:
-    """Metres between pixels: the second number of a converter from pixels."""
+    """Return the distance of pixels [m]: the second number of a converter from pixels."""
     category, base, *_, numbers = np.ravel(surface.attrs[key])[0]
     if (category, base) != (b"LateralCat", b"Pixels") or not numbers[1] > 0:
         raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")

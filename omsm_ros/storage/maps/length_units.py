@@ -34,7 +34,7 @@ class LengthUnits:
 
 
 def metres_in(name: str) -> float | None:
-    """Metres in the unit called ``name``; None if no such unit of length is known."""
+    """Return the unit called ``name`` [m]; None if no such unit of length is known."""
     return METRES.get(name, METRES.get(name.lower()))
 
 

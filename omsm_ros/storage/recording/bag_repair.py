@@ -76,7 +76,7 @@ def _beside(path: Path) -> Path:
 
 
 def _number(part: Path) -> tuple[int, str]:
-    """Its place among the files of a rosbag2 folder, which end in _0, _1, … _10."""
+    """Return its place among the files of a rosbag2 folder, which end in _0, _1, … _10."""
     number = part.stem.rpartition("_")[2]
     return (int(number) if number.isdecimal() else 0, part.name)
 
@@ -147,7 +147,7 @@ class _Copy:
 
 
 def _within(kind: int, body: bytes) -> list[McapRecord]:
-    """The definitions, channels and messages of a record; an exception if it is damaged."""
+    """Return the definitions, channels and messages of a record; an exception if it is damaged."""
     stream = ReadDataStream(BytesIO(body))
     if kind == Opcode.SCHEMA:
         return [Schema.read(stream)]

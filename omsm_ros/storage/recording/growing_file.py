@@ -48,7 +48,7 @@ class GrowingFile:
         self._waiting += data
 
     def tell(self) -> int:
-        """Bytes taken so far."""
+        """Return the bytes taken so far."""
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
