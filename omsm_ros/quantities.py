@@ -69,7 +69,7 @@ class Quantity:
         return values if good is None else np.where(good, values, np.nan)
 
     def _plausible(self, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-        """True where a number lies in the range, or None if all do."""
+        """Return True where a number lies in the range, or None if all do."""
         # One fast pass proves most arrays: no element exceeds the root of the sum of squares.
         if self.low == -self.high and float(np.vdot(values, values)) <= self.high * self.high:
             return None
@@ -95,7 +95,7 @@ class Quantity:
 
 
 def _number(value: object, whole: bool) -> float | int | None:
-    """The value as a number, or None if it is none."""
+    """Return ``value`` as a number, or None if it is none."""
     if isinstance(value, bool | np.bool_):
         return None
     if isinstance(value, int | np.integer):
@@ -111,7 +111,7 @@ def _number(value: object, whole: bool) -> float | int | None:
 
 
 def shown(value: object) -> str:
-    """A foreign value in a message: on one line, and no longer than a reader can bear."""
+    """Return a foreign value as a message shows it: on one line, and short."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, a nest of lists

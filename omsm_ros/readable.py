@@ -139,7 +139,7 @@ def raised(power: int) -> str:
 
 
 def _exponent(value: float, unit: str) -> int:
-    """Power of ten of the prefix."""
+    """Return the power of ten of the prefix."""
     if unit in _WITHOUT_PREFIX or not value:
         return 0
     exponent = 3 * (math.floor(math.log10(abs(value))) // 3)

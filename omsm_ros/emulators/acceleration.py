@@ -16,7 +16,7 @@ class AccelerationFeed:
         self._period = recording.axes.sample_period
 
     def due(self, played: int) -> AccelerationBlock | None:
-        """What has been felt until the trigger ``played``, and not been handed out yet."""
+        """Return what has been felt until the trigger ``played``, and not been handed out yet."""
         whole = self._whole
         if whole is None:
             return None

@@ -73,7 +73,7 @@ class ChrocodileEmulator(Instrument):
         super().__init__(line, source, triggered=triggered, clock=clock, seed=seed)
 
     def reset(self) -> None:
-        """As from the factory: ASCII, distance and intensity, 1 kHz, free running, started."""
+        """Go back to the factory's settings: ASCII, distance and intensity, 1 kHz, free running."""
         self._requests = RequestParser()
         self._values = {"SHZ": "1000", "LAI": "100", "AVD": "1", "THR": "10", "SEN": "0"}
         self._values["SODX"] = f"{DISTANCE} {INTENSITY}"

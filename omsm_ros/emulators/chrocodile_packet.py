@@ -76,7 +76,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
             self.say(encode_format(self._format))
 
     def _describe(self) -> None:
-        """A new data format; its order is the device's own."""
+        """Announce a new data format; its order is the device's own."""
         self._format_counter += 1
         numbers = sorted(self._layout.signals)
         signals = tuple((n, SIGNALS[n].type, 1) for n in numbers)

@@ -106,7 +106,7 @@ class Line(Protocol):
         """Whether anybody listens."""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Bytes of ``data`` that were taken; fewer without a reader or when ``stop`` is set."""
+        """Write ``data``; return bytes taken, fewer without a reader or once ``stop`` is set."""
 
 
 class GenericStreamEmulator:
@@ -214,7 +214,7 @@ class FaultyLine:
         self.runs_on = False
 
     def transmit(self, frames: FrameArray) -> tuple[list[bytes], BoolArray, Played]:
-        """Pieces of wire, True where a piece decodes to its frame, and the samples' account."""
+        """Return pieces of wire, True where one decodes to its frame, and the samples' account."""
         copies = 1 - self._strike(self._faults.drop, len(frames)).astype(int)
         copies += copies * self._strike(self._faults.duplicate, len(frames))
         sent = int(copies.sum())

@@ -123,14 +123,14 @@ class Instrument:
     # --- what a model fills in
 
     def reset(self) -> None:
-        """Settings as after switching on."""
+        """Set everything as after switching on."""
 
     def rate(self) -> float:
-        """Samples per second as set."""
+        """Return the samples per second as set."""
         return 1 / self._source.period if self._source is not None else 1.0
 
     def streaming(self) -> bool:
-        """Whether samples are to be sent."""
+        """Return whether samples are to be sent."""
         return True
 
     def work(self) -> None:
@@ -140,7 +140,7 @@ class Instrument:
         """Do what is done for a new client."""
 
     def receive(self, data: bytes) -> None:
-        """Commands, in any portions."""
+        """Take commands, in any portions."""
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
         """Wire bytes of each sample, or of several in their first one's place."""
@@ -205,13 +205,13 @@ class Instrument:
         self._off_until = self._clock() + seconds
 
     def power_cycle(self, seconds: float) -> None:
-        """Off for a while, then on as from the factory, counting from zero."""
+        """Switch off for a while, then on as from the factory, counting from zero."""
         self.unplug(seconds)
         self.restart()
         self._started = self._off_until
 
     def restart(self) -> None:
-        """Settings and counter as after switching on; the line stays up."""
+        """Set settings and counter as after switching on; the line stays up."""
         self._counter = 0
         self._kept = b""
         self._later.clear()
@@ -219,7 +219,7 @@ class Instrument:
         self.reset()
 
     def stall(self, seconds: float) -> None:
-        """Neither send nor answer for a while; what was measured meanwhile is lost."""
+        """Stop sending and answering for a while; what was measured meanwhile is lost."""
         self._quiet_until = self._clock() + seconds
 
     def reset_counter(self) -> None:
@@ -233,7 +233,7 @@ class Instrument:
     # --- measuring and sending
 
     def _measure(self, now: float) -> list[bytes]:
-        """Samples that have become due, packed; empty while none are to be sent."""
+        """Return the samples that have become due, packed; empty while none are to be sent."""
         elapsed = (now - self._origin) * self._lapse
         self._origin = now
         if self._source is None or now < self._started:
@@ -256,7 +256,7 @@ class Instrument:
         return self.streaming() and self._clock() >= max(self._quiet_until, self._off_until)
 
     def _times(self, count: int, now: float) -> np.ndarray:
-        """Device time of the last ``count`` samples [ns]."""
+        """Return the device time of the last ``count`` samples [ns]."""
         true_period = 1 / (self.rate() * self.faults.rate)
         if self._lapse == 1.0:
             last = now - self._started - self._due * true_period
@@ -267,7 +267,7 @@ class Instrument:
         return np.rint(device).astype(np.int64) + self._clock_offset
 
     def _disturb(self, measured: Measured) -> Measured:
-        """Saturation and dropouts, at the beginning of the portion."""
+        """Return the saturation and dropouts, at the beginning of the portion."""
         status, distance = measured.status.copy(), measured.distance.copy()
         intensity = measured.intensity.copy()
         saturated = _use(self.faults, "saturate", len(measured))

@@ -32,7 +32,7 @@ class Clock:
         return self.now
 
     def nanoseconds(self) -> int:
-        """Nanoseconds."""
+        """Return the time [ns]."""
         return round(self.now * NANOSECONDS_PER_S)
 
 
@@ -101,7 +101,7 @@ class Loopback:
         self._to_driver = self._to_device = b""
 
     def read(self, timeout: float) -> bytes:
-        """What comes within ``timeout`` [s] of simulated time."""
+        """Return what comes within ``timeout`` [s] of simulated time."""
         deadline = self.clock.now + timeout
         while True:
             if not self._open:
@@ -115,7 +115,7 @@ class Loopback:
             self._work(self._interval)
 
     def write(self, data: bytes) -> None:
-        """To the instrument."""
+        """Write to the instrument."""
         if not self._open:
             raise DeviceError("connection to 'loopback' was lost; open it again")
         self._to_device += data

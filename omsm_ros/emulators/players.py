@@ -29,7 +29,7 @@ _READING = ProbeReading(full_scale=100 * MICROMETRE_M, zero=Probe().half_range)
 
 
 def line_for(link: str) -> Pty | TcpServer:
-    """The emulated port: ``tcp://127.0.0.1:port``, or the path of a link to a pseudo-terminal."""
+    """Return the emulated port: ``tcp://127.0.0.1:port`` or a pseudo-terminal's path."""
     if not link.startswith("tcp://"):
         return Pty(link)
     if not (link.startswith(_TCP) and link.removeprefix(_TCP).isdecimal()):
@@ -180,7 +180,7 @@ EMULATED = {
 
 
 def emulated(device: str) -> Emulated:
-    """The emulated device of that name; ConfigurationError if there is none."""
+    """Return the emulated device of that name; ConfigurationError if there is none."""
     if device not in EMULATED:
         raise ConfigurationError(f"device {device!r}, expected one of {sorted(EMULATED)}")
     return EMULATED[device]

@@ -100,14 +100,14 @@ class Pty:
         return True
 
     def read(self) -> bytes:
-        """What the driver sent; b"" if nothing."""
+        """Return what the driver sent; b"" if nothing."""
         try:
             return os.read(self._descriptor(), _CHUNK_BYTES)
         except OSError:  # nothing there, or no driver
             return b""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Bytes of ``data`` a driver can get: fewer without one, or when ``stop`` is set."""
+        """Return bytes of ``data`` a driver can get: fewer without one, or when ``stop`` is set."""
         remaining = memoryview(data)
         while remaining and not (stop and stop.is_set()):
             events = self._events(_LOOK_S)

@@ -39,7 +39,7 @@ class Source(Protocol):
     period: float
 
     def take(self, first: int, count: int) -> Measured:
-        """Samples ``first`` to ``first + count``; those beyond the length are left out."""
+        """Return samples ``first`` to ``first + count``; those beyond the length are left out."""
 
 
 class RecordingSource:
@@ -74,7 +74,7 @@ class NumberedSource:
         self.period = period
 
     def take(self, first: int, count: int) -> Measured:
-        """distance = (10 + k mod 80) µm, y = -k nm, z = k mod 1000 µm, b = k µrad, c = k mrad."""
+        """Return distance (10 + k mod 80) µm, y -k nm, z k mod 1000 µm, b k µrad, c k mrad."""
         k = np.arange(first, first + count, dtype=np.float64)
         return Measured(
             (10 + k % 80) * 1e-6,

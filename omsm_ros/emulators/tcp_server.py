@@ -74,7 +74,7 @@ class TcpServer:
         return self._client is not None
 
     def read(self) -> bytes:
-        """What the client sent; b"" if nothing."""
+        """Return what the client sent; b"" if nothing."""
         self._accept()
         if self._client is None:
             return b""
@@ -89,7 +89,7 @@ class TcpServer:
         return data
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Bytes of ``data`` a client can get: fewer without one, or when ``stop`` is set."""
+        """Return bytes of ``data`` a client can get: fewer without one, or when ``stop`` is set."""
         self._accept()
         remaining = memoryview(data)
         while remaining and self._client is not None and not (stop and stop.is_set()):
@@ -119,7 +119,7 @@ class TcpServer:
             self.sessions += 1
 
     def _gone(self) -> bool:
-        """Whether the client has closed its end."""
+        """Return whether the client has closed its end."""
         if self._client is None:
             return True
         try:
