@@ -27,11 +27,11 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     """
     calibration = identified.calibration
     certificate = CertificatePage(
-        calibration,
-        _today(),
-        source,
-        __version__,
-        certificate_figures_of(calibration, fitted_record(identified)),
+        calibration=calibration,
+        date=_today(),
+        source=source,
+        version=__version__,
+        figures=certificate_figures_of(calibration, fitted_record(identified)),
     )
     files = {picture_name(name): picture for name, picture in certificate.figures.items()}
     files[MARKDOWN] = render_markdown(certificate).encode("utf-8", "replace")
@@ -50,12 +50,12 @@ def write_model_page(
     source: name of the record, for a reader
     """
     page = ModelPage(
-        model,
-        run,
-        _today(),
-        source,
-        __version__,
-        model_figures_of(model, record.input, record.output, run),
+        model=model,
+        run=run,
+        date=_today(),
+        source=source,
+        version=__version__,
+        figures=model_figures_of(model, record.input, record.output, run),
     )
     with result_folder(out, (MODEL_PAGE,)) as folder:
         save_bytes(folder / MODEL_PAGE, render_model(page).encode("utf-8", "replace"))

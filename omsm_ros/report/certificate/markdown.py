@@ -12,7 +12,6 @@ from omsm_ros.report.certificate.page import (
     CertificatePage,
     Section,
     headlines,
-    issued,
     sections,
     verdict_on_calibration,
 )
@@ -42,7 +41,7 @@ def _lines(certificate: CertificatePage) -> Iterator[str]:
     verdict = verdict_on_calibration(certificate.calibration)
     yield "# Calibration certificate"
     yield ""
-    yield text(issued(certificate))
+    yield text(certificate.issue)
     yield ""
     yield f"**{text(verdict.word)}**"
     yield ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,12 @@ from omsm_ros.core.sampled.model import SCHEMA, SampledModel
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
 from omsm_ros.report.certificate import model_figures as drawn
-from omsm_ros.report.certificate.page import Section
 from omsm_ros.report.certificate.tables import known_rows, texts
 from omsm_ros.report.common import style
+from omsm_ros.report.common.page_parts import Headline, IssuedPage, Section, present
 from omsm_ros.report.common.tables import Table, mapping_table, part
-from omsm_ros.report.common.template import check_places, fill, picture
+from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import Verdict
-from omsm_ros.report.measurement.page import Headline
 
 BAND, RECORD, CORRELATION = "band", "record", "correlation"
 CAPTIONS = {
@@ -39,25 +38,13 @@ _NOTE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class ModelPage:
-    """The model, a free run over a record, and what a reader is to be told of both.
+@dataclass(frozen=True, kw_only=True)
+class ModelPage(IssuedPage):
+    """The model, a free run over a record, and what a reader should know of both."""
 
-    date: of issue;  source: the record;  version: of the software
-    figures: PNG files by the names in :data:`CAPTIONS`
-
-    Raises ConfigurationError for a figure of another name.
-    """
-
+    captions = CAPTIONS
     model: SampledModel
     run: FreeRun
-    date: str
-    source: str = ""
-    version: str = ""
-    figures: Mapping[str, bytes] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_places(self.figures, CAPTIONS)
 
 
 def model_figures_of(
@@ -77,7 +64,7 @@ def render_model(page: ModelPage) -> str:
     return fill(
         "certificate.html",
         heading="Model",
-        issued=" · ".join(text for text in (page.source, f"issued {page.date}") if text),
+        issued=page.issued(),
         closing=_NOTE,
         figures=page.figures,
         verdict=verdict_on_model(page.model),
@@ -134,14 +121,7 @@ def _sections(page: ModelPage) -> list[Section]:
         Section("Coefficients", (), tuple(_coefficient_tables(page.model))),
         Section("Records", (), (_identity(page), _limits(certificate))),
     ]
-    return [
-        Section(
-            section.title,
-            tuple(name for name in section.figures if name in page.figures),
-            tuple(table for table in section.tables if table.rows),
-        )
-        for section in every
-    ]
+    return present(every, page.figures)
 
 
 def _coefficient_tables(model: SampledModel) -> list[Table]:

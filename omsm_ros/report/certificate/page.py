@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import reading as reading
 from omsm_ros.report.certificate import tables as tables
 from omsm_ros.report.common import style
+from omsm_ros.report.common.page_parts import Headline, IssuedPage, Section, present
 from omsm_ros.report.common.response_figures import step_response
 from omsm_ros.report.common.tables import Table, latency_text, mapping_table
-from omsm_ros.report.common.template import check_places, fill, picture
+from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import Verdict
-from omsm_ros.report.measurement.page import Headline
 from omsm_ros.units import DEGREE_RAD, PPM
 
 BAND = "band"
@@ -42,36 +42,17 @@ _CLOSING = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class CertificatePage:
-    """Everything on the page; what is absent is left out.
+@dataclass(frozen=True, kw_only=True)
+class CertificatePage(IssuedPage):
+    """Everything on the page; what is absent is left out."""
 
-    date: of issue, as it is to be printed
-    source: the recording that it was identified from, for a reader
-    version: of the software
-    figures: PNG files by the names in :data:`CAPTIONS`
-
-    Raises ConfigurationError for a figure of another name.
-    """
-
+    captions = CAPTIONS
     calibration: Calibration
-    date: str
-    source: str = ""
-    version: str = ""
-    figures: Mapping[str, bytes] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        check_places(self.figures, CAPTIONS)
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """Figures beside each other, then tables; ``note`` is for the reader."""
-
-    title: str
-    figures: tuple[str, ...]
-    tables: tuple[Table, ...]
-    note: str = ""
+    @property
+    def issue(self) -> str:
+        """Recording, date and identity on one line."""
+        return self.issued(self.calibration.id[:16])
 
 
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
@@ -105,7 +86,7 @@ def render(certificate: CertificatePage) -> str:
     return fill(
         "certificate.html",
         heading="Calibration certificate",
-        issued=issued(certificate),
+        issued=certificate.issue,
         closing=f"{_CLOSING} Calibration {certificate.calibration.id}.",
         figures=certificate.figures,
         verdict=verdict_on_calibration(certificate.calibration),
@@ -115,12 +96,6 @@ def render(certificate: CertificatePage) -> str:
         picture=lambda name: picture(certificate.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
-
-
-def issued(certificate: CertificatePage) -> str:
-    """Return recording, date and identity on one line."""
-    identity = certificate.calibration.id[:16]
-    return " · ".join(p for p in (certificate.source, f"issued {certificate.date}", identity) if p)
 
 
 def verdict_on_calibration(calibration: Calibration) -> Verdict:
@@ -211,8 +186,8 @@ def _range_headline(calibration: Calibration) -> Headline:
         shown = number(calibration.certificate.get("shown_up_to_hz"))
         name, details = "Valid up to", [f"half the sampling rate is {quantity(nyquist, 'Hz')}"]
         if shown is not None and calibration.valid_up_to < nyquist:
-            told = calibration.valid_up_to < shown
-            ends = "the band exceeds its limits" if told else "the motion excites too little"
+            known = calibration.valid_up_to < shown
+            ends = "the band exceeds its limits" if known else "the motion excites too little"
             details.insert(0, f"beyond it {ends}")
     return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
 
@@ -280,14 +255,4 @@ def sections(certificate: CertificatePage) -> list[Section]:
             ),
         ),
     ]
-    present = [_present(section, certificate.figures) for section in every]
-    return [section for section in present if section.figures or section.tables]
-
-
-def _present(section: Section, figures: Mapping[str, bytes]) -> Section:
-    return Section(
-        section.title,
-        tuple(name for name in section.figures if name in figures),
-        tuple(table for table in section.tables if table.rows),
-        section.note,
-    )
+    return present(every, certificate.figures)

@@ -12,12 +12,12 @@ from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, figure, percent, plain, probability, quantity
 from omsm_ros.report.common import style
+from omsm_ros.report.common.page_parts import Headline
 from omsm_ros.report.common.tables import Table
 from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.difference import figures
 from omsm_ros.report.maps.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
-from omsm_ros.report.measurement.page import Headline
 
 _VERDICTS = {
     "agree": ("good", "The two measurements agree"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from omsm_ros.report.common.study_page import StudyPage, StudySection, fill_study
+from omsm_ros.report.common.page_parts import Section
+from omsm_ros.report.common.study_page import StudyPage, fill_study
 from omsm_ros.report.common.tables import Table
 from omsm_ros.report.common.verdict import Verdict
 
@@ -42,8 +43,8 @@ def render(page: ExperimentPage) -> str:
             subtitle="on the digital twin",
             verdict=Verdict("unknown", "Side by side", (page.summary,)),
             sections=(
-                StudySection("The paper's figures beside ours", (beside,)),
-                StudySection("Measured", page.tables, tuple(page.figures)),
+                Section("The paper's figures beside ours", tables=(beside,)),
+                Section("Measured", tuple(page.figures), page.tables),
             ),
             captions=page.captions,
             figures=page.figures,

@@ -9,6 +9,7 @@ from typing import Any
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.readable import quantity
 from omsm_ros.report.common import tables
+from omsm_ros.report.common.page_parts import Headline
 from omsm_ros.report.common.tables import part
 from omsm_ros.report.common.template import check_places, fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
@@ -91,15 +92,6 @@ class Report:
 
     def __post_init__(self) -> None:
         check_places(self.figures, CAPTIONS)
-
-
-@dataclass(frozen=True, slots=True)
-class Headline:
-    """One of the numbers at the top."""
-
-    name: str
-    value: str
-    detail: str
 
 
 def render(report: Report) -> str:

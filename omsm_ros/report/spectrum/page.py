@@ -11,7 +11,8 @@ from omsm_ros.core.spectra.hypotheses import KINDS, UNDECIDED, StudiedScan
 from omsm_ros.core.spectra.ripple_guard import Named
 from omsm_ros.readable import count, plain, quantity
 from omsm_ros.report.common import style
-from omsm_ros.report.common.study_page import StudyPage, StudySection, fill_study
+from omsm_ros.report.common.page_parts import Section
+from omsm_ros.report.common.study_page import StudyPage, fill_study
 from omsm_ros.report.common.tables import Table
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.report.spectrum import figures
@@ -57,10 +58,10 @@ def render(page: SpectrumPage) -> str:
             subtitle=", ".join(scan["name"] for scan in scans),
             verdict=_verdict(summary),
             sections=(
-                StudySection("Lines", tuple(_peak_table(scan) for scan in scans), ("time",)),
-                StudySection("Evidence", (_felt_table(scans),), ("evidence", "path")),
-                StudySection("Scans", (_scan_table(scans), _sampling_table(scans)), ("motion",)),
-                StudySection("Band stop", (_stop_table(scans),)),
+                Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
+                Section("Evidence", ("evidence", "path"), (_felt_table(scans),)),
+                Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
+                Section("Band stop", tables=(_stop_table(scans),)),
             ),
             captions=CAPTIONS,
             figures=page.figures,

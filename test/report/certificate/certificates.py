@@ -17,7 +17,7 @@ def certified(calibration, **entries):
 
 
 def bare(calibration):
-    return CertificatePage(calibration, "today")
+    return CertificatePage(calibration=calibration, date="today")
 
 
 def by_name(calibration):

@@ -42,7 +42,13 @@ def figures(calibration, fitted):
 
 @pytest.fixture(scope="module")
 def certificate(calibration, figures):
-    return CertificatePage(calibration, "2025-01-31 12:00 UTC", "steps.mcap", "0.1.0", figures)
+    return CertificatePage(
+        calibration=calibration,
+        date="2025-01-31 12:00 UTC",
+        source="steps.mcap",
+        version="0.1.0",
+        figures=figures,
+    )
 
 
 @pytest.fixture(scope="module")

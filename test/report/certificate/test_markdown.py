@@ -46,7 +46,9 @@ class TestMarkdown:
             settings={attack: attack},
             certificate={"verdict": attack, "reasons": [attack], "warnings": [attack]},
         )
-        text = render_markdown(CertificatePage(hostile, attack, attack, attack))
+        text = render_markdown(
+            CertificatePage(calibration=hostile, date=attack, source=attack, version=attack)
+        )
         assert "<script" not in text
         assert "<img" not in text
         assert not re.search(r"(?<!\\)\]\(", text)

@@ -51,7 +51,9 @@ def record():
 
 def page_of(model, record, **parts):
     run = free_run(model, *record)
-    return ModelPage(model, run, "today", figures=model_figures_of(model, *record, run), **parts)
+    return ModelPage(
+        model=model, run=run, date="today", figures=model_figures_of(model, *record, run), **parts
+    )
 
 
 @pytest.mark.parametrize("model", [HELD, SMOOTH])

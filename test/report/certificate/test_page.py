@@ -79,14 +79,16 @@ class TestPage:
                 "two_mass": {"model": ATTACK}, "noise_m": ATTACK, "modal_remainder": ATTACK,
             },
         )  # fmt: skip
-        page = Page(render(CertificatePage(hostile, ATTACK, ATTACK, ATTACK)))
+        page = Page(
+            render(CertificatePage(calibration=hostile, date=ATTACK, source=ATTACK, version=ATTACK))
+        )
         assert not {"script", "img"} & set(page.tags)
         assert not any(key.startswith("on") for key, _ in page.attributes)
         assert "<script>alert('x')</script>" in page.text
 
     def test_a_figure_without_a_place_is_refused(self, calibration):
         with pytest.raises(ConfigurationError, match="'selfie'"):
-            CertificatePage(calibration, "today", figures={"selfie": b""})
+            CertificatePage(calibration=calibration, date="today", figures={"selfie": b""})
 
 
 class TestOlderCertificates:
@@ -124,7 +126,7 @@ class TestOlderCertificates:
             covariance=np.zeros((2, 2)),
         )
         figures = {"band": style.png(certificate_figures.response_with_band(still))}
-        certificate = CertificatePage(still, "today", figures=figures)
+        certificate = CertificatePage(calibration=still, date="today", figures=figures)
         assert "0 poles, 0 zeros, delay" in Page(render(certificate)).text
 
 
