@@ -91,7 +91,8 @@ class CapaNcdtDevice(BlockStreamDevice):
         found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
         if found is None:
             raise DeviceError(
-                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}"
+                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}; "
+                "choose another sample_period"
             )
         if abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
             raise DeviceError(

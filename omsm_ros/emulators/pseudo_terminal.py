@@ -55,7 +55,9 @@ class Pty:
             self._make_link()
         except OSError as err:
             self.close()
-            raise DeviceError(f"cannot create link {str(self._link)!r}: {err}") from err
+            raise DeviceError(
+                f"cannot create link {str(self._link)!r}: {err}; choose another"
+            ) from err
         except ConfigurationError:
             self.close()
             raise

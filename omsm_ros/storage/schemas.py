@@ -44,7 +44,7 @@ def _said(found: jsonschema.ValidationError) -> str:
         case "additionalProperties":
             known = sorted(found.schema["properties"])  # type: ignore[index, call-overload]
             unknown = next(name for name in found.instance if name not in known)  # type: ignore[union-attr]
-            return f"{shown(unknown)} is unknown, expected of {known}"
+            return f"{shown(unknown)} is unknown, expected one of {known}"
         case "required":
             missing = [name for name in wanted if name not in found.instance]  # type: ignore[operator, union-attr]
             return f"{missing[0]} is required and missing; write it there"

@@ -39,7 +39,7 @@ def test_what_is_stated_arrives(tmp_path):
         (TILT.replace("rad", "mrad"), "tilt is stated in 'mrad', expected 'rad'"),
         (NOISE.replace("unit: m", "unit: nm"), "probe_noise is stated in 'nm', expected 'm'"),
         (TILT.replace("unit: rad, ", ""), "unit is required and missing"),
-        (TILT.replace("tilt", "tlit"), "'tlit' is unknown, expected of"),
+        (TILT.replace("tilt", "tlit"), "'tlit' is unknown, expected one of"),
         (WAVE.replace("per_turn: 2, ", ""), "spindle_axial needs per_turn"),
         (TILT.replace("5.0e-6", "yes"), "value is 'yes', expected a number"),
         (TILT.replace("declared", "guessed"), "how is 'guessed'"),

@@ -96,7 +96,7 @@ def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
     if min(wide, high) <= 0:
         raise DataError(
             f"the points cover {quantity(wide, 'm')} × {quantity(high, 'm')}, which is no area; "
-            "a profile cannot be made into a map"
+            "a profile cannot be made into a map; give points that cover one"
         )
     side = max(float(np.sqrt(wide * high / len(x))), extent / most)
     while extent / side > _FEWEST_CELLS_ACROSS:

@@ -82,7 +82,7 @@ def freedoms_named(names: Sequence[str]) -> tuple[str, ...]:
     """Return freedoms in their order; ConfigurationError for a name that is none."""
     for name in names:
         if name not in FREEDOMS:
-            raise ConfigurationError(f"freedom {name!r} is unknown, expected of {[*FREEDOMS]}")
+            raise ConfigurationError(f"freedom {name!r} is unknown, expected one of {[*FREEDOMS]}")
     return tuple(name for name in FREEDOMS if name in names)
 
 

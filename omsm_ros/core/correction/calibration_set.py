@@ -99,7 +99,9 @@ def calibration_set(
     positions = tuple(float(position) for position, _ in ordered)
     members = tuple(calibration for _, calibration in ordered)
     if len(set(positions)) < len(positions):
-        raise CalibrationError(f"two calibrations stand at one {along}: {positions!r}")
+        raise CalibrationError(
+            f"two calibrations stand at one {along}: {positions!r}; give each a place of its own"
+        )
     _check_alike(members)
     middle = members[_nearest_to_middle(positions)]
     return CalibrationSet(

@@ -59,7 +59,7 @@ class StatedSource:
         allowed = [name for name in NAMES if name not in _OF_CALIBRATION]
         if self.source not in allowed:
             raise ConfigurationError(
-                f"uncertainty {shown(self.source)} is unknown, expected of {sorted(allowed)}"
+                f"uncertainty {shown(self.source)} is unknown, expected one of {sorted(allowed)}"
             )
         for name, value, known in (
             ("how", self.how, (EVALUATED, DECLARED)),

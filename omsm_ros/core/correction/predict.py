@@ -114,7 +114,7 @@ def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: floa
     if len(z) <= 2 * settling:
         raise DataError(
             f"motion of {len(z)} samples, expected more than {2 * settling}: the filter needs "
-            f"{settling} to settle"
+            f"{settling} to settle; give a longer motion"
         )
     return (z - through(digital, z))[settling:]
 

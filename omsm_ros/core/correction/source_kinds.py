@@ -51,7 +51,7 @@ def source_of(
     for key, size in parameters.items():
         if key not in kind.parameters:
             raise ConfigurationError(
-                f"{name} has no parameter {key!r}, expected of {sorted(kind.parameters)}"
+                f"{name} has no parameter {key!r}, expected one of {sorted(kind.parameters)}"
             )
         kind.parameters[key].checked(size, ConfigurationError, f"{name}.{key}")
     for key in kind.parameters:

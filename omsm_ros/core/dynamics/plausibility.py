@@ -39,7 +39,7 @@ def check_dynamics(dynamics: TransferFunction, sample_period: float) -> None:
     if abs(dynamics.dc_gain - 1) > _UNIT_GAIN:
         raise CalibrationError(
             f"G_m(0), the first coefficient of the numerator, is {dynamics.dc_gain!r}, expected 1; "
-            "the gain at rest belongs into static_gain; identify it again"
+            "the gain at rest belongs in static_gain; identify it again"
         )
     DELAY.checked(dynamics.delay, CalibrationError)
     _check_samples("delay", dynamics.delay, sample_period, MAX_DELAY_SAMPLES)

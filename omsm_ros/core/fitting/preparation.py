@@ -24,7 +24,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.least_squares import least_squares
-from omsm_ros.readable import quantity
+from omsm_ros.readable import plain, quantity
 
 # What happened before the record is forgotten after this time.
 _SETTLING_S = 50e-3
@@ -101,8 +101,8 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     used &= carried == motion
     if np.sum(used) < LEAST_SAMPLES:
         raise StepTestError(
-            f"of {samples!r} samples {int(np.sum(used))!r} are left to compare, without those "
-            "lost, while something settles, and where the motion starts or ends; record at least "
+            f"{int(np.sum(used))} of {samples} samples can be compared: others are lost, or taken "
+            "while something settles or the motion starts or ends; record at least "
             f"{LEAST_SAMPLES} more"
         )
     output = np.where(record.ok, record.distance, 0.0)
@@ -176,8 +176,8 @@ def check_gain(gain: float) -> None:
     low, high = _PLAUSIBLE_GAIN
     if not low <= abs(gain) <= high:
         raise IdentificationError(
-            f"the probe moves by {gain!r} per travel of the axis, expected about 1: check that it "
-            "looks at a fixed target within its range, that both are in metres, and that Z "
+            f"the probe moves by {plain(gain)} per travel of the axis, expected about 1: check that "
+            "it looks at a fixed target within its range, that both are in metres, and that Z "
             "moves to and fro, for what goes evenly one way is taken for drift"
         )
 

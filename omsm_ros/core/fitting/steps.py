@@ -15,7 +15,7 @@ from scipy import special
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
-from omsm_ros.units import MICROMETRE_M
+from omsm_ros.readable import quantity
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
 LEAST_SAMPLES = 50
@@ -74,21 +74,17 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
 
     Raises StepTestError when the axis does not move, or moves farther than any probe sees.
     """
-    if len(z) < LEAST_SAMPLES:
-        raise StepTestError(
-            f"{len(z)!r} samples are too few to identify anything; "
-            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
-        )
+    _check_length(len(z))
     noise, travel = sample_noise(z), float(np.ptp(z))
     if travel > _GREATEST_TRAVEL_M:
         raise StepTestError(
-            f"Z travels {travel!r} m, more than any probe can follow on a fixed target; "
-            "positions must be in metres"
+            f"Z travels {quantity(travel, 'm')}, more than the {quantity(_GREATEST_TRAVEL_M, 'm')} "
+            "that a probe can follow on a fixed target; positions must be in metres"
         )
     if travel <= max(_NOISE_FACTOR * noise, 1e-12):
         raise StepTestError(
-            f"Z moves by {travel / MICROMETRE_M!r} µm at a noise of {noise / MICROMETRE_M!r} µm: "
-            "no steps; run the step test while recording"
+            f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: these are no "
+            "steps; run the step test while recording"
         )
     moving = _moving(z, sample_period, max(_NOISE_FACTOR * noise, _TRAVEL_PART * travel))
     return Steps(_edges(z, moving), moving, noise, travel)
@@ -159,14 +155,18 @@ def backlash_columns(steps: Steps, samples: int) -> FloatArray:
 
 def check_usable(record: MotionRecord) -> None:
     """Raise StepTestError when too few samples of the record can be used, saying why."""
-    if len(record) < LEAST_SAMPLES:
-        raise StepTestError(
-            f"{len(record)!r} samples are too few to identify anything; "
-            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
-        )
+    _check_length(len(record))
     usable = int(np.sum(record.ok))
     if usable < LEAST_SAMPLES:
         raise StepTestError(
             f"{usable!r} of {len(record)} samples are usable (counts {dict(record.counts)!r}); "
             "check the probe's target and range, and the encoder"
+        )
+
+
+def _check_length(samples: int) -> None:
+    if samples < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{samples} samples are too few to identify anything; "
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
         )

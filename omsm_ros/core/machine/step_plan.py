@@ -109,7 +109,8 @@ def plan_steps(
         )
     if dwell < 3 * rise:
         raise ConfigurationError(
-            f"step plan: dwell {dwell!r} s leaves no rest after a rise of {rise!r} s"
+            f"step plan: dwell {dwell!r} s leaves no rest after a rise of {rise!r} s; "
+            f"dwell {3 * rise!r} s or longer"
         )
     edges = np.arange(1, 2 * count + 1)
     dither = (edges * _GOLDEN) % 1.0 * sample_period

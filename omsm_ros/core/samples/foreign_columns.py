@@ -114,7 +114,7 @@ class ColumnMap:
     def __post_init__(self) -> None:
         unknown = sorted(set(self.columns) - set(CHANNELS))
         if unknown:
-            raise DataError(f"channel {unknown[0]!r} is unknown, expected of {list(CHANNELS)}")
+            raise DataError(f"channel {unknown[0]!r} is unknown, expected one of {list(CHANNELS)}")
         if self.sample_period is None and "time" not in self.columns:
             raise DataError("neither sample_period nor a column of time; give one of them")
         if self.sample_period is not None:

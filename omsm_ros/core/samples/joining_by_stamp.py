@@ -104,7 +104,10 @@ def axes_at_probe(
         )
     tracks = [_Track.of(run, clock) for run, clock in _runs(axes)]
     if not any(track.spline for track in tracks):
-        raise DataError("no run of axis samples is long enough to interpolate")
+        raise DataError(
+            f"no {_SPLINE_DEGREE + 1} axis samples on end are finite, so none can be interpolated; "
+            "check that the axes were recorded without gaps"
+        )
     nodes = delay + (0.5 * exposure * _EXPOSURE_NODES if exposure else np.zeros(1))
     weights = _EXPOSURE_WEIGHTS if exposure else np.ones(1)
     blocks = []

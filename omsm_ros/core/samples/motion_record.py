@@ -129,7 +129,7 @@ def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]
     periods = sorted({float(block.sample_period) for block in blocks})
     if periods[-1] > periods[0] * (1 + SAME_PERIOD):
         raise DataError(
-            f"{name} blocks of different sample periods {periods!r} s; identify them apart"
+            f"{name} blocks of different sample periods {periods!r} s; identify each by itself"
         )
     return periods[0]
 
@@ -217,19 +217,20 @@ def _by_counter(
     trigger: CommonTrigger = EQUAL_COUNTS,
 ) -> MotionRecord:
     grid = _Grid.of(axes)
-    seen, ok, account = grid.matched("distance", distance, trigger)
+    output, ok, account = grid.matched("distance", distance, trigger)
     lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
     if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
             f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
             f"{distance[0].first_sample} share no trigger count at the same time: they are not of "
-            f"one recording, or their stamps differ by more than {STAMP_TOLERANCE_S} s"
+            f"one recording, or their stamps differ by more than {STAMP_TOLERANCE_S} s; record both "
+            "at the same time, with clocks that agree"
         )
     own = replace(trigger, counter_offset=0)
     return MotionRecord(
         sample_period=period,
         z=_filled(grid.z, grid.known),
-        distance=seen,
+        distance=output,
         ok=grid.known & ok,
         reference=grid.matched("reference", reference, own)[0] if reference else None,
         z_lost=None if np.all(grid.known) else ~grid.known,

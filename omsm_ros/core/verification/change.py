@@ -99,7 +99,10 @@ def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
     limits = [calibration.valid_up_to for calibration in calibrations]
     top = min(limits) * _COMPARED_PART
     if not top > _LEAST_BAND_HZ:
-        raise CalibrationError(f"no common band: valid up to {limits!r} Hz")
+        raise CalibrationError(
+            f"the calibrations have no common band: they are valid up to {limits!r} Hz; identify "
+            "the one that ends lowest again"
+        )
     return np.asarray(np.linspace(top / _LINES, top, _LINES))
 
 

@@ -36,7 +36,7 @@ def check_places(figures: Iterable[str], places: Iterable[str]) -> None:
     unknown = sorted(set(figures) - set(places))
     if unknown:
         raise ConfigurationError(
-            f"figures {unknown!r} have no place on the page, expected of {[*places]}"
+            f"figures {unknown!r} have no place on the page, expected one of {[*places]}"
         )
 
 

@@ -90,7 +90,7 @@ def test_too_little_left_between_the_ends_is_said(lost):
     z = 20e-6 * np.sin(2 * np.pi * 15e-3 * np.arange(120 if lost.start else 60))
     distance = np.random.default_rng(0).normal(-z, 1e-8)
     distance[lost] = np.nan
-    with pytest.raises(StepTestError, match="are left to compare"):
+    with pytest.raises(StepTestError, match="can be compared"):
         identify(MotionRecord.from_arrays(1e-3, z, distance))
 
 
