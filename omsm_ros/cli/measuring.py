@@ -25,7 +25,8 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.machine.limits import FASTEST, MachineLimits, ScanPath
+from omsm_ros.core.machine.limits import FASTEST, MachineLimits
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.measure import Registering, measure

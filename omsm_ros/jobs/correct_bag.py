@@ -17,7 +17,7 @@ from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.machine.limits import PathStart, ScanPath
+from omsm_ros.core.machine.scan_path import PathStart, ScanPath
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.even_selection import EvenSelection

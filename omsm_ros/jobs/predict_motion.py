@@ -6,7 +6,7 @@ import numpy as np
 
 from omsm_ros.core.correction.predict import Prediction, predict_error
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.machine.limits import ScanPath
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
 from omsm_ros.jobs.read_bag import path_in

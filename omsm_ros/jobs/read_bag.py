@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from omsm_ros.core.machine.limits import PathStart, ScanPath
+from omsm_ros.core.machine.scan_path import PathStart, ScanPath
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bags

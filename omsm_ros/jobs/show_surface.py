@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.machine.limits import MachineLimits, ScanPath, speed_limits
+from omsm_ros.core.machine.limits import MachineLimits, speed_limits
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import FloatArray

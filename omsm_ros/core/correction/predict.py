@@ -23,11 +23,11 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.limits import (
     FASTEST,
     MachineLimits,
-    ScanPath,
     SpeedLimit,
     highest_factor,
     speed_limits,
 )
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.readable import plain, quantity

@@ -16,15 +16,12 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.machine.kinematics import workpiece_xy
-from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.units import MICROMETRE_M
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 
-# The slope of a wave of a millimetre is short by 0.07 %, and rounding far below a microradian.
-_SLOPE_STEP_M = 10 * MICROMETRE_M
 # Without a nominal surface its slopes come from a polynomial through the points.
 _POLYNOMIAL_DEGREE = 6
 
@@ -81,7 +78,7 @@ class ScanPoints:
         if surface is None:
             slope_x, slope_y = _polynomial_slopes(self.x, self.y, self.height)
         else:
-            slope_x, slope_y = _nominal_slopes(surface, self.x, self.y)
+            slope_x, slope_y = slopes_by_differences(surface, self.x, self.y)
         return replace(self, slope_x=slope_x, slope_y=slope_y)
 
     def sideways(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -147,15 +144,6 @@ def standard_fields(
     for source in sources:
         found.setdefault(source.name, []).append(source.standard_fields(points))
     return {name: np.concatenate(parts) for name, parts in found.items()}
-
-
-def _nominal_slopes(
-    surface: Surface, x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    step = _SLOPE_STEP_M
-    along_x = surface.height(x + step, y) - surface.height(x - step, y)
-    along_y = surface.height(x, y + step) - surface.height(x, y - step)
-    return along_x / (2 * step), along_y / (2 * step)
 
 
 def _polynomial_slopes(

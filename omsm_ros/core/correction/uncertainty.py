@@ -20,7 +20,7 @@ from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discr
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.dynamics.recursion import past_motion, past_rest
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
 from omsm_ros.quantities import (
@@ -29,7 +29,6 @@ from omsm_ros.quantities import (
     TIME_UNCERTAINTY,
     UNCERTAINTY,
 )
-from omsm_ros.units import MICROMETRE_M
 
 # What single readings of a scan scatter by beyond what is stated of them.
 SCAN_SCATTER = "scan_scatter"
@@ -146,10 +145,7 @@ def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> Sur
 
     The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
     """
-    step = 10 * MICROMETRE_M
-    x, y = points.x, points.y
-    slope_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
-    slope_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
+    slope_x, slope_y = slopes_by_differences(surface, points.x, points.y)
     variance = points.uncertainty**2 + lateral**2 * (slope_x**2 + slope_y**2)
     return replace(points, uncertainty=np.sqrt(variance))
 

@@ -15,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import signal
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.held_problem import inside_unit_circle
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import least_squares
 
@@ -73,7 +74,7 @@ class DiscreteStarts:
         found = least_squares(columns, target)
         try:
             simulated = signal.lfilter(
-                found[order:-1], np.poly(_inside(_poles(found[:order]))).real, self.input
+                found[order:-1], np.poly(inside_unit_circle(_poles(found[:order]))).real, self.input
             )
             instruments, _ = self._regressors(self.input, simulated, order)
             by_instruments = np.asarray(
@@ -86,7 +87,7 @@ class DiscreteStarts:
 
     def _prefiltered(self, order: int, poles: ComplexArray) -> ComplexArray:
         for _ in range(_ITERATIONS):
-            denominator = np.poly(_inside(poles)).real
+            denominator = np.poly(inside_unit_circle(poles)).real
             u, y = (
                 signal.lfilter([1.0], denominator, values) for values in (self.input, self._filled)
             )
@@ -125,9 +126,3 @@ def _poles(coefficients: FloatArray) -> ComplexArray:
     if not np.all(np.isfinite(coefficients)):
         return np.empty(0, np.complex128)
     return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
-
-
-def _inside(poles: ComplexArray) -> ComplexArray:
-    """Return ``poles`` with those outside the unit circle reflected into it."""
-    outside = np.abs(poles) > 1
-    return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)

@@ -69,11 +69,15 @@ class DiscreteScaled(Scaled):
 
     def of_discrete(self, poles: ComplexArray) -> FloatArray:
         """Return ψ of ``poles`` in z (n,), conjugates included; unstable ones are reflected."""
-        outside = np.abs(poles) > 1
-        inside = np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
-        inside = inside * (1 - _OFF_BORDER)
+        inside = inside_unit_circle(poles) * (1 - _OFF_BORDER)
         bilinear = np.asarray(_PER_BILINEAR * (inside - 1) / (inside + 1), np.complex128)
         return self.nonlinear_of(bilinear, 0.0)
+
+
+def inside_unit_circle(poles: ComplexArray) -> ComplexArray:
+    """Return ``poles`` in z with those outside the unit circle reflected into it."""
+    outside = np.abs(poles) > 1
+    return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
 
 
 class HeldProblem(Problem):

@@ -176,8 +176,8 @@ def check_gain(gain: float) -> None:
     low, high = _PLAUSIBLE_GAIN
     if not low <= abs(gain) <= high:
         raise IdentificationError(
-            f"the probe moves by {plain(gain)} per travel of the axis, expected about 1: check that "
-            "it looks at a fixed target within its range, that both are in metres, and that Z "
+            f"the probe moves by {plain(gain)} per travel of the axis, expected about 1: check "
+            "that it looks at a fixed target within its range, that both are in metres, and that Z "
             "moves to and fro, for what goes evenly one way is taken for drift"
         )
 

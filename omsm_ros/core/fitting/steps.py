@@ -78,13 +78,13 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
     noise, travel = sample_noise(z), float(np.ptp(z))
     if travel > _GREATEST_TRAVEL_M:
         raise StepTestError(
-            f"Z travels {quantity(travel, 'm')}, more than the {quantity(_GREATEST_TRAVEL_M, 'm')} "
-            "that a probe can follow on a fixed target; positions must be in metres"
+            f"Z travels {quantity(travel, 'm')}, a probe follows a fixed target over "
+            f"{quantity(_GREATEST_TRAVEL_M, 'm')} at most; positions must be in metres"
         )
     if travel <= max(_NOISE_FACTOR * noise, 1e-12):
         raise StepTestError(
-            f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: these are no "
-            "steps; run the step test while recording"
+            f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: no steps; "
+            "run the step test while recording"
         )
     moving = _moving(z, sample_period, max(_NOISE_FACTOR * noise, _TRAVEL_PART * travel))
     return Steps(_edges(z, moving), moving, noise, travel)

@@ -223,7 +223,7 @@ def _by_counter(
         raise DataError(
             f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
             f"{distance[0].first_sample} share no trigger count at the same time: they are not of "
-            f"one recording, or their stamps differ by more than {STAMP_TOLERANCE_S} s; record both "
+            f"one recording, or their stamps differ by over {STAMP_TOLERANCE_S} s; record both "
             "at the same time, with clocks that agree"
         )
     own = replace(trigger, counter_offset=0)

@@ -6,7 +6,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.units import MICROMETRE_M
 
@@ -35,12 +35,7 @@ def gradient_of(surface: Surface, x: FloatArray, y: FloatArray) -> Gradient:
     """Return the slopes of ``surface`` at x, y [m]; by differences if it knows its height alone."""
     if isinstance(surface, SlopedSurface):
         return surface.gradient(x, y)
-    pairs = ((_STEP_M, 0.0), (0.0, _STEP_M))
-    along_x, along_y = (
-        (surface.height(x + dx, y + dy) - surface.height(x - dx, y - dy)) / (2 * _STEP_M)
-        for dx, dy in pairs
-    )
-    return np.asarray(along_x, np.float64), np.asarray(along_y, np.float64)
+    return slopes_by_differences(surface, x, y, _STEP_M)
 
 
 def unit_normal(slope_x: FloatArray, slope_y: FloatArray) -> FloatArray:

@@ -16,7 +16,8 @@ from omsm_ros.core.correction.predict import (
 )
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.limits import FASTEST, MachineLimits, ScanPath
+from omsm_ros.core.machine.limits import FASTEST, MachineLimits
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.core.machine.trajectories import Chirp, Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError

@@ -11,7 +11,8 @@ from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.limits import MachineLimits, ScanPath
+from omsm_ros.core.machine.limits import MachineLimits
+from omsm_ros.core.machine.scan_path import ScanPath
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 
 PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015

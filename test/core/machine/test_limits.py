@@ -9,14 +9,11 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.limits import (
     FASTEST,
     MachineLimits,
-    PathStart,
-    ScanPath,
-    content_frequency,
     following_error,
     highest_factor,
     speed_limits,
-    steepest,
 )
+from omsm_ros.core.machine.scan_path import PathStart, ScanPath, content_frequency, steepest
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR

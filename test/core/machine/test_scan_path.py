@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omsm_ros.core.machine.limits import PathStart
+from omsm_ros.core.machine.scan_path import PathStart
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 
 TIME = np.arange(1000) * 1e-3
