@@ -24,25 +24,22 @@ from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.errors import FileError
 from omsm_ros.jobs.registered_points import registered
-from omsm_ros.storage import strict_json
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import (
     REPORT,
     SUMMARY,
     SYSTEMATIC,
-    read_text,
     save_json,
     save_text,
 )
 from omsm_ros.storage.maps.columns_file import write_columns
 from omsm_ros.storage.maps.length_units import LengthUnits
 from omsm_ros.storage.maps.read_map import read_points
+from omsm_ros.storage.result_folder import read_result
 
 DIFFERENCE, MAP = "difference.json", "difference.csv"
 
-_MAX_SUMMARY_BYTES = 10_000_000
 _METHOD = (
     "local quadratic regression on means of square cells, tricube weights over 2.4 cells, "
     "beside a polynomial of degree 6"
@@ -97,9 +94,7 @@ def _calibration_of(path: Path) -> str:
     summary = path / SUMMARY
     if not summary.is_file():
         return ""
-    text = read_text(summary, _MAX_SUMMARY_BYTES, FileError, "summary")
-    content = strict_json.object_of(text, FileError, f"summary {str(summary)!r}")
-    return str(content.get("calibration", ""))
+    return str(read_result(summary, "summary").get("calibration", ""))
 
 
 def _fields_beside(path: Path, points: MeasuredPoints) -> ScanFields | None:

@@ -19,8 +19,7 @@ from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.catalogue import Catalogue, time_of
 from omsm_ros.storage.files import SUMMARY, read_text
-
-_MAX_SUMMARY_BYTES = 10_000_000
+from omsm_ros.storage.result_folder import MAX_RESULT_BYTES
 
 
 def keep_calibration(
@@ -53,7 +52,7 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
     False if it is there already: the same summary in the same folder.
     """
     path = folder / SUMMARY
-    text = read_text(path, _MAX_SUMMARY_BYTES, FileError, "summary")
+    text = read_text(path, MAX_RESULT_BYTES, FileError, "summary")
     summary = strict_json.object_of(text, FileError, f"summary {str(path)!r}")
     settings = _object(_part(summary, "settings"))
     source = bag if bag is not None else Path(str(summary.get("bag", "")))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.errors import FileError
 from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import bode
 from omsm_ros.report.maps.surface_map import EmbeddedMap, Layer, embedded
@@ -20,11 +19,9 @@ from omsm_ros.report.measurement.cloud_view import CloudView
 from omsm_ros.report.measurement.figures import zernike_terms
 from omsm_ros.report.measurement.gallery import levelled, surface_figures
 from omsm_ros.report.measurement.page import Report, render
-from omsm_ros.storage import strict_json
-from omsm_ros.storage.files import DEVIATION, FORM, REPORT, read_text, save_text
+from omsm_ros.storage.files import DEVIATION, FORM, REPORT, save_text
 from omsm_ros.storage.maps.read_map import read_points
-
-_MAX_FORM_BYTES = 10_000_000
+from omsm_ros.storage.result_folder import read_result
 
 
 def figures_of(
@@ -102,5 +99,4 @@ def _form_in(out: Path) -> dict[str, Any]:
     """Return the content of ``form.json`` in ``out``; empty where the part was not registered."""
     if not (out / FORM).is_file():
         return {}
-    text = read_text(out / FORM, _MAX_FORM_BYTES, FileError, "form")
-    return strict_json.object_of(text, FileError, f"form {str(out / FORM)!r}")
+    return read_result(out / FORM, "form")

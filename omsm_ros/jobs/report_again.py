@@ -6,14 +6,12 @@ from pathlib import Path
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.errors import CalibrationError, FileError
+from omsm_ros.errors import CalibrationError
 from omsm_ros.jobs.correct_bag import MOST_DRAWN
 from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
-from omsm_ros.storage import strict_json
 from omsm_ros.storage.cloud_file import CloudFile
-from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, read_text
-
-_MAX_SUMMARY_BYTES = 10_000_000
+from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
+from omsm_ros.storage.result_folder import read_result
 
 
 def report_again(result: Path, calibration: Calibration, nominal: Surface | None = None) -> Path:
@@ -23,9 +21,7 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
     Raises FileError for a folder that holds no measurement, CalibrationError for another
     calibration than the one it was corrected with.
     """
-    what = f"summary {str(result / SUMMARY)!r}"
-    text = read_text(result / SUMMARY, _MAX_SUMMARY_BYTES, FileError, "summary")
-    summary = strict_json.object_of(text, FileError, what)
+    summary = read_result(result / SUMMARY, "summary")
     used = summary.get("calibration")
     if used != calibration.id:
         raise CalibrationError(

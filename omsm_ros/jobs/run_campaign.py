@@ -25,6 +25,7 @@ from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import SUMMARY, read_text, said, save_json
+from omsm_ros.storage.result_folder import read_result
 from omsm_ros.storage.schemas import check_form
 
 DONE, REFUSED, CRASHED = "done", "refused", "crashed"
@@ -32,7 +33,6 @@ STATE = "campaign.json"
 
 _SCHEMA = "omsm-campaign/1"
 _MAX_STATE_BYTES = 50_000_000
-_MAX_SUMMARY_BYTES = 10_000_000
 # A process that the system kills for want of memory may fare better when its neighbour is done.
 _ATTEMPTS = 2
 _LOCAL_HOSTS = ("127.0.0.1", "::1", "localhost")
@@ -155,9 +155,7 @@ def load_campaign(out: Path) -> list[Entry]:
 
 def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
     """Return the summary of a bag that is done; FileError if it is gone or damaged."""
-    path = out / entry.folder / SUMMARY
-    text = read_text(path, _MAX_SUMMARY_BYTES, FileError, "summary")
-    return strict_json.object_of(text, FileError, f"summary {str(path)!r}")
+    return read_result(out / entry.folder / SUMMARY, "summary")
 
 
 # ------------------------------------------------------------------------------ one bag

@@ -1,4 +1,4 @@
-"""The topic ``calibration``: it tells the one in force, in whatever order nodes start again.
+"""The topic ``calibration``: it carries the one in force, in whatever order nodes start again.
 
 Its stamp is the time since when it is in force. Every node that deals with calibrations listens,
 and whoever hears a newer one says it again: so all that is latched is the newest, and one of the
@@ -28,7 +28,7 @@ _AHEAD_NS = 10 * 10**9
 
 
 class CalibrationTopic:
-    """Tells what its node puts in force, hands it what others do.
+    """Publishes what its node puts in force, and hands it what others do.
 
     calibration, since_ns: in force, and since when [ns]; None before there is one
     refused: why the last one heard was not taken; empty if it was

@@ -53,7 +53,7 @@ _STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceB
 
 
 class CalibratorNode(ManagedNode):
-    """Serves ``~/identify``; keeps every calibration, and tells the one in force."""
+    """Serves ``~/identify``; keeps every calibration, and publishes the one in force."""
 
     def __init__(self) -> None:
         super().__init__("calibrator", PARAMETERS)
@@ -111,12 +111,12 @@ class CalibratorNode(ManagedNode):
         """Keep a second cell from taking this one's calibrations for its own."""
         try:
             undo.enter_context(claimed(self._folder.link))
-        except FileError as err:  # where nothing can be kept, a calibration is told all the same
+        except FileError as err:  # what cannot be kept is published all the same
             self._trouble = str(err)
             self.get_logger().error(self._trouble)
 
     def _take_up(self) -> None:
-        """Tell what was in force before this start."""
+        """Publish what was in force before this start."""
         try:
             known = self._folder.in_force()
         except OmsmError as err:
@@ -128,7 +128,7 @@ class CalibratorNode(ManagedNode):
             self._last = f"{known[0].id[:12]} in force, as before the start"
 
     def _adopt(self, calibration: Calibration, since_ns: int) -> None:
-        """Keep what another node put in force; it is told even if it cannot be kept."""
+        """Keep what another node put in force; it is published even if it cannot be kept."""
         verdict, reasons = verdict_of(calibration)
         if verdict == REJECTED:
             raise ConfigurationError(f"rejected: {'; '.join(reasons)}")

@@ -13,7 +13,7 @@ _STREAMS = ("axes", "distance")
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
 # Of the two seconds of small blocks that wait at most, half.
 _BEHIND_MS = 1000.0
-# Reasons that tell of something lost on the way, unlike a probe that looks past its target.
+# Reasons that are a sign of something lost on the way, unlike a probe that looks past its target.
 _LOSSES = ("unmatched", "late", "overdue")
 
 
@@ -79,7 +79,7 @@ class CorrectionState:
         return report
 
     def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
-        """Enter every count of the account; return those that may tell of trouble."""
+        """Enter every count of the account; return those that may mean trouble."""
         watched: dict[str, float] = {}
         for stream, account in corrector.account.as_dict().items():
             counts: dict[str, int] = {**account}  # type: ignore[dict-item]

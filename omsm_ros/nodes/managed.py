@@ -1,4 +1,4 @@
-"""What every node of this package is: managed, told apart by its parameters, honest of its state.
+"""What every node of this package is: managed, set by its parameters, honest about its state.
 
 ``ros2 lifecycle`` takes it from unconfigured (parameters may be set) over inactive (they are in
 force) to active (it works) and back; unless ``autostart`` is false it goes there by itself. A

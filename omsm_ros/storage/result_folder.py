@@ -1,4 +1,4 @@
-"""Results that belong together are put in place together: all of one run, or none of it."""
+"""A folder of results: put in place together, all of one run or none of it; and read again."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from omsm_ros.errors import FileError
-from omsm_ros.storage.files import beside, said
+from omsm_ros.storage import strict_json
+from omsm_ros.storage.files import beside, read_text, said
+
+# A summary of ours has tens of kilobytes.
+MAX_RESULT_BYTES = 10_000_000
 
 
 @contextmanager
@@ -73,3 +78,12 @@ def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
             part.replace(target / part.name)
     finally:
         os.close(lock)
+
+
+def read_result(path: Path, what: str) -> dict[str, Any]:
+    """Return the object in a JSON file of results, such as ``summary.json``, called ``what``.
+
+    FileError where it is not there, too large, or no JSON object.
+    """
+    text = read_text(path, MAX_RESULT_BYTES, FileError, what)
+    return strict_json.object_of(text, FileError, f"{what} {str(path)!r}")
