@@ -7,7 +7,7 @@ not zero but unknown, and the budget says so.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -32,14 +32,8 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.samples.blocks import FloatArray
 
-_RANDOM_SAYS = {
-    "probe_noise": "noise of a reading",
-    "probe_resolution": "step of a reading",
-    "encoder_noise": "noise of the Z encoder",
-    "encoder_resolution": "step of the Z encoder",
-    "discretisation": "difference of the digital filter from G",
-    "vibration": "of the probe against the turning part",
-    SCAN_SCATTER: "scatter of this scan beyond what is stated",
+_RANDOM_SAYS = {each.name: each.metadata["says"] for each in fields(ErrorSources)} | {
+    SCAN_SCATTER: "scatter of this scan beyond what is stated"
 }
 # The noise that a step test tells is that of encoder plus probe at rest: it holds these.
 _HELD = ("probe_resolution", "encoder_noise", "encoder_resolution")

@@ -9,7 +9,8 @@ path; where Z follows the surface that costs ``δ dH(z)/dt`` of height.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -28,6 +29,7 @@ from omsm_ros.quantities import (
     GAIN_UNCERTAINTY,
     TIME_UNCERTAINTY,
     UNCERTAINTY,
+    Quantity,
 )
 
 # What single readings of a scan scatter by beyond what is stated of them.
@@ -38,12 +40,13 @@ _NEGLIGIBLE = 1e-6
 _ORDER = 5
 
 
-# All others are lengths.
-_QUANTITIES = {
-    "static_gain": GAIN_UNCERTAINTY,
-    "lateral_lag": TIME_UNCERTAINTY,
-    "pitch": ANGLE_UNCERTAINTY,
-}
+def _source(says: str = "", quantity: Quantity = UNCERTAINTY) -> Any:
+    """Return a field of :class:`ErrorSources`, zero by default.
+
+    says: what it is of, for the budget; empty for one that acts on the whole scan too, which
+        :mod:`source_kinds` describes;  quantity: its plausible range
+    """
+    return field(default=0.0, metadata={"says": says, "quantity": quantity})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,21 +63,21 @@ class ErrorSources:
     pitch: of the Z slide's pitch [rad], which moves the beam by itself times the Abbe arm
     """
 
-    probe_noise: float = 0.0
-    probe_resolution: float = 0.0
-    encoder_noise: float = 0.0
-    encoder_resolution: float = 0.0
-    static_gain: float = 0.0
-    lateral_lag: float = 0.0
-    motion_error: float = 0.0
-    discretisation: float = 0.0
-    vibration: float = 0.0
-    pitch: float = 0.0
+    probe_noise: float = _source("noise of a reading")
+    probe_resolution: float = _source("step of a reading")
+    encoder_noise: float = _source("noise of the Z encoder")
+    encoder_resolution: float = _source("step of the Z encoder")
+    static_gain: float = _source(quantity=GAIN_UNCERTAINTY)
+    lateral_lag: float = _source(quantity=TIME_UNCERTAINTY)
+    motion_error: float = _source()
+    discretisation: float = _source("difference of the digital filter from G")
+    vibration: float = _source("of the probe against the turning part")
+    pitch: float = _source(quantity=ANGLE_UNCERTAINTY)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            quantity = _QUANTITIES.get(field.name, UNCERTAINTY)
-            quantity.checked(getattr(self, field.name), ConfigurationError, field.name)
+        for each in fields(self):
+            quantity = each.metadata["quantity"]
+            quantity.checked(getattr(self, each.name), ConfigurationError, each.name)
 
     @classmethod
     def of(cls, calibration: Calibration) -> ErrorSources:
