@@ -158,8 +158,8 @@ def summarise(
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
-    audited = judged.get("discretisation", {}).get("rms", 0.0)
-    return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, audited)
+    of_filter = judged.get("discretisation", {}).get("rms", 0.0)
+    return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
 
 
 def _places(calibration: Calibration) -> dict[str, Any]:
