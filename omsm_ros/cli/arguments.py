@@ -59,7 +59,7 @@ def json_object(text: str) -> dict[str, object]:
 def add_bags(sub: argparse.ArgumentParser, *names: str, **described: Any) -> None:
     """Add arguments that name bags, and the options that say which of their topics are the cell's.
 
-    described: of each, as for ``add_argument``; what they name is told by :func:`cell_of`
+    described: of each, as for ``add_argument``; :func:`cell_of` says what they name
     """
     for name in names:
         sub.add_argument(name, type=Path, **described)

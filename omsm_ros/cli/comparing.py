@@ -113,13 +113,13 @@ def _show_difference(facts: Facts) -> None:
                    f"{percent(found['shared_area'], 3)} of the smaller area"),
     ]  # fmt: skip
     for name, n in facts["e_n"].items():
-        told = (
+        words = (
             "not evaluated"
             if n["e_n"] is None
             else f"{plain(n['e_n'])} (U {_length(n['expanded'])})"
         )
         label = f"E_n of {figure(name)}"
-        rows.append((label, f"{told}: {_length(n['a'])} and {_length(n['b'])}"))
+        rows.append((label, f"{words}: {_length(n['a'])} and {_length(n['b'])}"))
     if facts["within"] is not None:
         rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
     table([*rows, ("written", ", ".join(facts["files"].values()))])

@@ -1,4 +1,4 @@
-"""The options of a registration, and how its result is told: form, correct."""
+"""The options of a registration, and how its result is shown: form, correct."""
 
 from __future__ import annotations
 

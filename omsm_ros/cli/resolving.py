@@ -122,7 +122,7 @@ def _show_selfcal(facts: Facts) -> None:
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
             ("left on this surface", f"{quantity(facts['left_on_this_surface'], 'm')} rms (k = 1)"),
             ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
-            *(("not told", text) for text in facts["not_told"]),
+            *(("not determined", text) for text in facts["not_told"]),
             ("written to", facts["calibration"]),
         ]
     )  # fmt: skip

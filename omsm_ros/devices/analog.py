@@ -84,7 +84,7 @@ class AnalogDevice:
 
     @property
     def identity(self) -> dict[str, str]:
-        """A converter tells nothing of its sensor."""
+        """A converter knows nothing of its sensor."""
         return {}
 
     @property
@@ -138,7 +138,7 @@ class Accelerometer(AnalogDevice):
 
 
 class AnalogReference(AnalogDevice):
-    """A displacement sensor with a voltage; beyond its range it tells no distance."""
+    """A displacement sensor with a voltage; beyond its range it measures no distance."""
 
     def __init__(
         self,

@@ -59,7 +59,7 @@ class BlockStreamDevice(StreamDevice):
 
     @property
     def identity(self) -> dict[str, str]:
-        """Return what the controller told of itself."""
+        """Return what the controller reported of itself."""
         return self._identity
 
     def _prepare(self) -> None:
@@ -105,5 +105,5 @@ class BlockStreamDevice(StreamDevice):
         raise NotImplementedError
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        """Set what was asked for, and return what the controller tells of itself."""
+        """Set what was asked for, and return what the controller reports of itself."""
         raise NotImplementedError

@@ -83,7 +83,7 @@ class BlockCutter:
 
     delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
     period_deviation: from nominal, relative: of the last full block's device time, or of the
-    arrivals of a device that tells no time
+    arrivals of a device that reports no time
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     """
 
@@ -188,12 +188,12 @@ class BlockCutter:
         if self._channels.axes is not None:
             axes = AxisBlock(**common, **self._positions(samples, self._channels.axes))  # type: ignore[arg-type]
         if self._channels.distance:
-            told = not np.isnan(samples["intensity"]).all()
+            reported = not np.isnan(samples["intensity"]).all()
             distance = DistanceBlock(
                 **common,  # type: ignore[arg-type]
                 distance=samples["distance"],
                 status=samples["status"],
-                intensity=samples["intensity"] if told else np.empty(0, np.float32),
+                intensity=samples["intensity"] if reported else np.empty(0, np.float32),
             )
         return BlockPair(axes, distance)
 

@@ -149,17 +149,17 @@ class Chrocodile(StreamDevice):
 
     @property
     def identity(self) -> dict[str, str]:
-        """Return what the device told of itself and its settings."""
+        """Return what the device reported of itself and its settings."""
         return self._identity
 
     @property
     def settings(self) -> dict[str, object]:
         """Return what moves a reading in time, or makes it another: model, head, rate, lamp …"""
         identity = self._identity
-        told = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
-        if not told:
+        reported = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
+        if not reported:
             return {}
-        return told | {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
+        return reported | {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
@@ -230,7 +230,7 @@ class Chrocodile(StreamDevice):
             return Answer(b"", "")
 
     def _read(self, name: str) -> None:
-        """Enter a setting that was left as it is; not every model tells it."""
+        """Enter a setting that was left as it is; not every model reports it."""
         if name not in self._identity and (found := self._try(name, QUERY).numbers):
             self._identity[name] = " ".join(f"{number:g}" for number in found)
 

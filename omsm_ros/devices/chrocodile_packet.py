@@ -53,7 +53,7 @@ class ChrocodilePacketDevice(Chrocodile):
         return super().counts() | asdict(self._decoder.statistics)
 
     def _begin(self) -> None:
-        """Wait until the device has told its whole configuration."""
+        """Wait until the device has reported its whole configuration."""
         self._decoder.reset()
         self._early.clear()
         self._commands.clear()

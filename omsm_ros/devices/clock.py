@@ -20,7 +20,7 @@ from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 WINDOW_S = 30.0
 # Arrivals closer than this count as one, their mean: it bounds the fit to 1500 points [s].
 _BIN_S = 0.02
-# Crystals differ by some tens of ppm; it holds the drift until arrivals tell it.
+# Crystals differ by some tens of ppm; it holds the drift until arrivals show it.
 _DRIFT_SIGMA = 100 * PPM
 # A drift beyond this, by five of its own uncertainties, is no crystal: a device that is played
 # faster than it was recorded, or set to another rate.
@@ -28,7 +28,7 @@ _NO_CRYSTAL = 1000 * PPM
 # Arrivals off the line by more than this, all to one side, for so long: a clock was set [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
 # Nothing arrives before it was sent: what is earlier than the line by more than a busy host may
-# have held up its first arrivals tells of a clock that was set, at once [s].
+# have held up its first arrivals is a sign of a clock that was set, at once [s].
 _EARLY_S = 1.0
 # And no sample is kept back for longer than this before it is sent [s].
 _OLDEST_S = 3600.0
@@ -64,7 +64,7 @@ class DeviceClock:
 
     @property
     def drift(self) -> float | None:
-        """Host seconds per device second, less one; None before it can be told."""
+        """Host seconds per device second, less one; None before it is known."""
         return self._slope if self._span >= _TELLING_S else None
 
     def observe(self, device_ns: int, arrival_ns: int) -> None:

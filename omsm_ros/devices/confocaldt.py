@@ -178,8 +178,12 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     @property
     def settings(self) -> dict[str, object]:
         """Return which controller it is, and its rate, where there is a command port."""
-        told = self._identity
-        return {name: told[name] for name in ("name", "article", "serial", "rate") if name in told}
+        reported = self._identity
+        return {
+            name: reported[name]
+            for name in ("name", "article", "serial", "rate")
+            if name in reported
+        }
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return confocal_dtype(kind)

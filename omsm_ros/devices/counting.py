@@ -14,7 +14,7 @@ from omsm_ros.units import NANOSECOND_S
 SAMPLE = np.dtype(
     [
         ("counter", "<i8"),  # as the device sends it, wraps
-        ("time", "<i8"),  # of the device [ns], does not wrap; 0 where it tells none
+        ("time", "<i8"),  # of the device [ns], does not wrap; 0 where it has none
         ("distance", "<f8"),  # [m], NaN where there is none
         ("intensity", "<f4"),  # 0-1, NaN where the device tells none
         ("status", "u1"),  # Status
@@ -79,7 +79,7 @@ class SequenceTracker:
 
     @property
     def held(self) -> int:
-        """Samples that wait for their successor to tell whether they are spoilt."""
+        """Samples that wait for their successor to show whether they are spoilt."""
         return len(self._held)
 
     def begin_anew(self) -> None:

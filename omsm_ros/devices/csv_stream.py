@@ -71,15 +71,15 @@ class CsvStreamDevice(StreamDevice):
         if self.channels.timed:
             samples["time"] = rows["device_time"]
         if "distance" in self._columns:
-            told = rows["distance"] != self._probe.invalid
-            raw = np.where(told, rows["distance"], np.nan)
+            measured = rows["distance"] != self._probe.invalid
+            raw = np.where(measured, rows["distance"], np.nan)
             samples["distance"] = self._probe.polarity * NANOMETRE_M * raw
             given = rows["status"] if "status" in self._columns else Status.OK
             known = np.where((given >= 0) & (given <= max(Status)), given, Status.LOST)
             good = known == Status.OK
             beyond = good & (abs(samples["distance"]) > self._probe.full_scale)
             known = np.where(beyond, Status.OUT_OF_RANGE, known)
-            samples["status"] = np.where(good & ~told, Status.NO_TARGET, known)
+            samples["status"] = np.where(good & ~measured, Status.NO_TARGET, known)
         for index, name in enumerate(AXIS_COLUMNS):
             if name in self._columns:
                 inside = np.clip(rows[name], -(2**40), 2**40)

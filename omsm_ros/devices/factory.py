@@ -191,7 +191,7 @@ def _axes(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScaling]
 
 
 def block_settings(values: Values) -> dict[str, Any]:
-    """Return what every device is told of its samples."""
+    """Return what every device needs to know of its samples."""
     return {"sample_period": values["sample_period"], "block_size": values["block_size"]}
 
 

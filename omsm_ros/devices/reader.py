@@ -59,7 +59,7 @@ class DeviceReader:
         back_off: tuple[float, float] = BACK_OFF_S,
         connected: Callable[[], None] = lambda: None,
     ) -> None:
-        """note: told once of each new trouble, and when it is over
+        """note: called once for each new trouble, and when it is over
         connected: called when the device was set up, before its samples are delivered
         """
         self.state = State.CONNECTING

@@ -122,12 +122,12 @@ class StreamDevice:
 
     @property
     def identity(self) -> dict[str, str]:
-        """Make, model, version and settings as the device told them; empty before it did."""
+        """Make, model, version and settings as the device reported them; empty before it did."""
         return {}
 
     @property
     def settings(self) -> dict[str, object]:
-        """What a calibration belongs to: how the device measures, as far as it told; JSON."""
+        """What a calibration belongs to: how the device measures, as far as it reported; JSON."""
         return {}
 
     @property

@@ -159,8 +159,8 @@ class ChrocodileEmulator(Instrument):
         nothing = measured.status == Status.NO_TARGET
         if number in (DISTANCE, DISTANCE_NM, DISTANCE_16):
             raw = self._probe.raw(measured.distance) / self._probe.unit(number)
-            told = np.where(nothing | np.isnan(raw), 0.0, raw)
-            return told if number == DISTANCE else np.clip(np.rint(told), -(2**31), 2**31 - 1)
+            sent = np.where(nothing | np.isnan(raw), 0.0, raw)
+            return sent if number == DISTANCE else np.clip(np.rint(sent), -(2**31), 2**31 - 1)
         if number in (INTENSITY, INTENSITY_16):
             light = measured.intensity * self._probe.intensity_full_scale
             return np.where(nothing, 0.0, np.rint(light) if number == INTENSITY_16 else light)

@@ -137,7 +137,7 @@ class GenericStreamEmulator:
         stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Played:
-        """Send every sample of ``recording``, paced, and tell what became of them.
+        """Send every sample of ``recording``, paced, and return what became of them.
 
         time_lapse: seconds of the device's clock per second of ours; inf does not wait
         stop: ends the play early, at any byte

@@ -24,7 +24,7 @@ class Pty:
     open are lost, as on a real line. While a driver has it open but does not read, ``write``
     waits: nothing is lost, where a real UART would overrun.
 
-    Nothing tells when another driver opens it, so ``sessions`` stays 0.
+    Nothing shows when another driver opens it, so ``sessions`` stays 0.
 
     Not imitated: baud rate, parity, modem lines, breaks.
     """

@@ -1,4 +1,4 @@
-"""What an emulated device measures: the twin's recordings, or samples that tell their number."""
+"""What an emulated device measures: the twin's recordings, or samples that hold their number."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ class RecordingSource:
         part = slice(first, first + count)
         axes, distance = self._recording.axes, self._recording.distance
         size = len(axes.z[part])
-        told = len(distance.intensity) > 0
+        reported = len(distance.intensity) > 0
         return Measured(
             distance.distance[part],
-            distance.intensity[part] if told else np.full(size, 0.5, np.float32),
+            distance.intensity[part] if reported else np.full(size, 0.5, np.float32),
             distance.status[part] if len(distance.status) else np.zeros(size, np.uint8),
             {name: getattr(axes, name)[part] for name in AXES},
         )
 
 
 class NumberedSource:
-    """Without end; sample k stands at x = k nm, so every sample tells which one it is.
+    """Without end; sample k stands at x = k nm, so every sample shows which one it is.
 
     The other channels follow from k too: see ``NumberedSource.take``.
     """

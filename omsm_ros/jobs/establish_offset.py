@@ -17,7 +17,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # As far as stamps may be off: a link that delivers late, and a clock that still learns [s].
 _STAMPS_S = 0.25
-# A session of an hour at 1 kHz; longer ones tell no more.
+# A session of an hour at 1 kHz; longer ones say no more.
 _MOST_SAMPLES = 4_000_000
 
 

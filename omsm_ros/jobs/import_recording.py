@@ -167,10 +167,10 @@ class _Source:
         self._check_period()
 
     def _check_period(self) -> None:
-        stated, told = self._table.sample_period, self._mapped.sample_period
-        if stated and told and abs(told / stated - 1) > MOST_PERIOD_ERROR:
+        stated, mapped = self._table.sample_period, self._mapped.sample_period
+        if stated and mapped and abs(mapped / stated - 1) > MOST_PERIOD_ERROR:
             raise FileError(
-                f"{self._table} states a sample period of {stated:g} s, the map {told:g} s; "
+                f"{self._table} states a sample period of {stated:g} s, the map {mapped:g} s; "
                 "correct the map"
             )
 

@@ -92,19 +92,19 @@ def _advice(form: Form) -> list[str]:
     fitted = [n for n in freedoms.fitted if n in MOVES]
     if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
         fitted = []
-    told = [
+    advice = [
         f"a move along {' and '.join(fitted)} looks like form here, and was fitted, so that little "
         "is known of form that looks so; if the part was not moved since it was cut, hold it: "
         "--fit piston,tip,tilt"
     ] * bool(fitted)
     if freedoms.held:
         others = ",".join(n for n in freedoms.fitted if n not in freedoms.held)
-        told.append(
+        advice.append(
             f"{' and '.join(freedoms.held)} held as in the nominal pose, for form looks like a "
             "move there; how far the part may be off all the same is in every uncertainty; if it "
             f"is known to sit within a micrometre, name what to fit: --fit {others}"
         )
-    return told
+    return advice
 
 
 def _curves(form: Form) -> dict[str, Any]:

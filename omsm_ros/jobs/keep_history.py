@@ -94,7 +94,7 @@ class MachineHistory:
     """One machine: its calibrations and measurements, and how its dynamics and results drift.
 
     delay: of the lag [s/s];  static_gain: [1/s];  deviation: of the form's rms [m/s]; None where
-    fewer than five tell
+    there are fewer than five
     """
 
     machine: str

@@ -70,7 +70,7 @@ class Entry:
     bag: below the campaign's folder;  folder: of its result, below that of the results
     fingerprint: of the bag, the calibration and the options that the result is of
     state: "done", "refused" (said: why) or "crashed" (said: by which signal)
-    recorded_ns: when the recording began [ns, ROS time], None where the bag cannot tell
+    recorded_ns: when the recording began [ns, ROS time], None where the bag does not say
     """
 
     bag: str
@@ -188,9 +188,9 @@ def correct_one(task: Task) -> Entry:
             continue
         if done.returncode == 0:
             return Entry(task.bag, task.folder, task.fingerprint, DONE, "", _recorded(task.path))
-        told = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
         if done.returncode > 0:
-            found = REFUSED, told.removeprefix("omsm: ")
+            found = REFUSED, last.removeprefix("omsm: ")
             break
         found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}"
     return Entry(task.bag, task.folder, task.fingerprint, *found)

@@ -21,7 +21,7 @@ from omsm_ros.units import RPM_HZ
 
 FIGURE = "surface.png"
 _ACROSS = 401
-# At the rim a spiral is fastest; four turns of it tell what the axes must do.
+# At the rim a spiral is fastest; four turns of it show what the axes must do.
 _TURNS, _SAMPLES_PER_TURN = 4, 2000
 _BAND = "calibrated band"
 

@@ -54,8 +54,8 @@ class SelfCalibrationOptions:
 
     harmonics: highest of the surface in a turn
     clocking: standard uncertainty of C from scan to scan [rad], 10 if the part was re-mounted
-    polarity, static_gain, gain_uncertainty, settings: of the probe, without a step test to tell
-        them; the uncertainty is a share of the gain
+    polarity, static_gain, gain_uncertainty, settings: of the probe, where no step test
+        finds them; the uncertainty is a share of the gain
     """
 
     harmonics: int = DEFAULT_HARMONICS

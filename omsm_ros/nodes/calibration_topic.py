@@ -57,7 +57,7 @@ class CalibrationTopic:
         """Return the stamp of what is put in force now: later than all that was before [ns]."""
         return max(self._now_ns(), self.since_ns + 1)
 
-    def tell(self, calibration: Calibration, since_ns: int) -> None:
+    def announce(self, calibration: Calibration, since_ns: int) -> None:
         """Say that ``calibration`` is in force since ``since_ns`` [ns]."""
         self.calibration, self.since_ns, self.refused = calibration, since_ns, ""
         message = conversions.calibration_message(self._messages, calibration, since_ns)
@@ -69,7 +69,7 @@ class CalibrationTopic:
         if known is not None and since_ns <= self.since_ns:
             return
         if known is not None and message.id == known.id:
-            self.tell(known, since_ns)
+            self.announce(known, since_ns)
             return
         try:
             heard = conversions.calibration(message)
@@ -81,14 +81,14 @@ class CalibrationTopic:
             )
             self._insist()
             return
-        self.tell(heard, since_ns)
+        self.announce(heard, since_ns)
 
     def _insist(self) -> None:
         """Say again, as the newest, what stays in force."""
         now = self.decided()
         if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:
             self._repeated_ns, refused = now, self.refused
-            self.tell(self.calibration, now)
+            self.announce(self.calibration, now)
             self.refused = refused
 
     def _plausible(self, stamp_ns: int) -> int:

@@ -95,15 +95,15 @@ class CalibratorNode(ManagedNode):
 
     def _on_probe(self, message: String, _: MessageInfo) -> None:
         try:
-            told = conversions.probe_settings(message)
+            reported = conversions.probe_settings(message)
         except OmsmError as err:
             self.get_logger().error(f"probe settings refused: {err}", throttle_duration_sec=5.0)
             return
-        if self._probe and told != self._probe:
+        if self._probe and reported != self._probe:
             self.get_logger().warning("the probe is set otherwise: motion before is forgotten")
             for buffer in self._buffers.values():
                 buffer.forget()
-        self._probe = told
+        self._probe = reported
 
     # ------------------------------------------------------------------- what is in force
 
@@ -124,7 +124,7 @@ class CalibratorNode(ManagedNode):
             self.get_logger().error(f"calibration in force: {err}")
             return
         if known is not None:
-            self._topic.tell(*known)
+            self._topic.announce(*known)
             self._last = f"{known[0].id[:12]} in force, as before the start"
 
     def _adopt(self, calibration: Calibration, since_ns: int) -> None:
@@ -174,7 +174,7 @@ class CalibratorNode(ManagedNode):
             # An earlier, good calibration stays in its file and in use.
             return False, f"rejected: {'; '.join(reasons)}"
         kept = self._keep_file(calibration, since_ns)
-        self._topic.tell(calibration, since_ns)
+        self._topic.announce(calibration, since_ns)
         return True, f"{verdict}; {calibration.id[:12]} {kept}"
 
     def _noted(self, bag: str, calibration: Calibration) -> str:

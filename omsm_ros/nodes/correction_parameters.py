@@ -89,7 +89,7 @@ PARAMETERS = (
         Parameter(
             f"sources.{field.name}",
             0.0,
-            "standard uncertainty, k = 1; 0 = what the certificate tells",
+            "standard uncertainty, k = 1; 0 = what the certificate states",
             _SOURCE_OF.get(field.name, quantities.UNCERTAINTY),
         )
         for field in fields(ErrorSources)

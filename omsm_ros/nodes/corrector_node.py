@@ -86,7 +86,7 @@ class CorrectorNode(ManagedNode):
 
     def _put_in_force(self, calibration: Calibration, since_ns: int) -> None:
         self._use(calibration)
-        self._topic.tell(calibration, since_ns)
+        self._topic.announce(calibration, since_ns)
 
     def _objections(self, calibration: Calibration) -> tuple[str, ...]:
         return objections(
@@ -115,13 +115,13 @@ class CorrectorNode(ManagedNode):
     def _on_probe(self, message: String, _: MessageInfo) -> None:
         """Stop correcting where the calibration belongs to a probe set otherwise; else begin."""
         try:
-            told = conversions.probe_settings(message)
+            reported = conversions.probe_settings(message)
         except OmsmError as err:
             self._complain(f"probe settings refused: {err}")
             return
-        if told == self._probe:
+        if reported == self._probe:
             return
-        self._probe = told
+        self._probe = reported
         known = self._topic.calibration
         if known is None or (self._corrector and self._objections(known) == self._overridden):
             return

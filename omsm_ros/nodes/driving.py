@@ -73,7 +73,7 @@ class DriverNode(ManagedNode):
             connected=self._tell_settings,
         )
         self._recent, self._flow = RecentIncrease(), Flow()
-        self._told: dict[str, object] = {}
+        self._reported: dict[str, object] = {}
         if self._settings_topic:
             self._settings = publish_on(
                 undo=undo, node=self, kind=String, topic=self._settings_topic, qos=LATCHED_QOS
@@ -108,10 +108,10 @@ class DriverNode(ManagedNode):
         if self._settings is None:
             return
         named = {"device": self.values["device"], **self._device.settings}
-        told = {f"{PROBE}{name}": value for name, value in named.items()}
-        if told != self._told:
-            self._told = told
-            self._settings.publish(String(data=strict_json.text_of(told)))
+        reported = {f"{PROBE}{name}": value for name, value in named.items()}
+        if reported != self._reported:
+            self._reported = reported
+            self._settings.publish(String(data=strict_json.text_of(reported)))
 
     def report(self) -> Report:
         """Return what became of every sample, and what is wrong now."""

@@ -78,7 +78,7 @@ class Listeners:
     def known(self) -> bool:
         """Whether all who listen were met, or cannot be.
 
-        The middleware may know of one before the graph tells who it is.
+        The middleware may know of one before the graph says who it is.
         """
         unseen = any(
             p.get_subscription_count() > self._seen[p.topic_name] for p in self._publishers
@@ -189,7 +189,7 @@ class Listeners:
         self._node.destroy_client(self._listeners.pop(name).client)
         self.deaf.add(name)
         self._node.get_logger().warning(
-            f"{name} listens but does not tell what it has taken (service {TAKEN}): it is not "
+            f"{name} listens but does not say what it has taken (service {TAKEN}): it is not "
             "waited for, and loses what its queue does not hold"
         )
 

@@ -92,13 +92,13 @@ class _Ending:
     def __init__(self) -> None:
         self.asked = threading.Event()
         self._wake: Callable[[], object] = lambda: None
-        self._heard, told = os.pipe()
-        os.set_blocking(told, False)
+        self._heard, woken = os.pipe()
+        os.set_blocking(woken, False)
         for number in ENDING:
             # Below nohup, it is to be ignored.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
-        signal.set_wakeup_fd(told)
+        signal.set_wakeup_fd(woken)
         threading.Thread(target=self._wait, daemon=True).start()
 
     def wakes(self, wake: Callable[[], object]) -> None:

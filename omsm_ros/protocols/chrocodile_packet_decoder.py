@@ -35,7 +35,7 @@ class PacketStatistics:
     """What became of every byte: ``received = in packets + discarded + pending``.
 
     packets: understood;  malformed: whose inside made no sense
-    unformatted: samples without the format that tells what they hold
+    unformatted: samples without the format that says what they hold
     """
 
     bytes_received: int

@@ -96,9 +96,9 @@ def distance_of(
     nothing = raw == 0
     light = first_of(INTENSITIES, signals)
     if light is not None:
-        told = records[str(light)].astype(np.float32)
-        intensity = np.clip(told / probe.intensity_full_scale, 0, 1).astype(np.float32)
-        nothing &= told == 0
+        reported = records[str(light)].astype(np.float32)
+        intensity = np.clip(reported / probe.intensity_full_scale, 0, 1).astype(np.float32)
+        nothing &= reported == 0
     nothing |= ~np.isfinite(raw)
     status = np.full(len(records), Status.OK, np.uint8)
     status[(raw < 0) | (raw > probe.full_scale)] = Status.OUT_OF_RANGE

@@ -89,7 +89,7 @@ class SerialDecoder:
     def feed(self, data: bytes) -> tuple[IntArray, IntArray]:
         """Return values (n, width) of the frames completed by ``data``, and how many were spoilt.
 
-        The second, (n,), tells for each frame in how many places since the frame before it
+        The second, (n,), says for each frame in how many places since the frame before it
         something was wrong.
         """
         self._received += len(data)

@@ -194,9 +194,9 @@ class BagReader:
         if not self.count([PROBE_TOPIC]):
             return []
         found: list[dict[str, object]] = []
-        for _, told in self.records(PROBE_TOPIC):
-            if told not in found:
-                found.append(told)
+        for _, reported in self.records(PROBE_TOPIC):
+            if reported not in found:
+                found.append(reported)
         return found
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:

@@ -70,7 +70,7 @@ def load_for_others(path: Path | str) -> Calibration:
         # Without its cause, which would be in the log that everybody can subscribe to.
         raise CalibrationError(
             f"{str(path)!r} is there, but no calibration that can be used; on that computer, "
-            f"'omsm compare {str(path)!r} {str(path)!r}' tells why"
+            f"'omsm compare {str(path)!r} {str(path)!r}' says why"
         ) from None
 
 

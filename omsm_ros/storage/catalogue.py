@@ -1,7 +1,7 @@
 """The catalogue: which calibrations and measurements there were, in a database.
 
 An SQLite file, or PostgreSQL where several cells share one. A row is added once, whatever how
-often it is told. SQLAlchemy is an optional package, loaded where a catalogue is asked for.
+often it is given. SQLAlchemy is an optional package, loaded where a catalogue is asked for.
 """
 
 from __future__ import annotations

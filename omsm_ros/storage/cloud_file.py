@@ -88,8 +88,8 @@ class CloudFile:
             head = stream.read(_PLY_HEADER_BYTES)
             held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
         self.points = max(held, 0) // _PLY_DTYPE.itemsize
-        told = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
-        if told != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:
+        lines = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
+        if lines != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:
             raise FileError(
                 f"{str(path)!r} is none of our clouds, or was cut short; correct the scan again"
             )

@@ -135,7 +135,7 @@ def calibration(message: Any) -> Calibration:
 
 
 def probe_settings(message: Any) -> dict[str, object]:
-    """Return what a probe's driver told of itself, a JSON object in a ``std_msgs/String``."""
+    """Return what a probe's driver reported, a JSON object in a ``std_msgs/String``."""
     return _json_object("probe_settings", message.data)
 
 

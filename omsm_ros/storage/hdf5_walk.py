@@ -13,7 +13,7 @@ from typing import Any
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS
 
-# To start a process, and to read from a slow disk; a damaged file of any size is told so soon.
+# To start a process, and to read from a slow disk; a damaged file of any size is known so soon.
 LIMIT_S, SLOWEST_BYTES_S = 3.0, 50e6
 
 

@@ -37,7 +37,7 @@ def load_limits(path: Path | str) -> MachineLimits:
 
 
 def load_pitch(path: Path | str) -> PitchCurve:
-    """Read ``PITCH.csv``: columns ``z_m,pitch_rad``, as an autocollimator along Z tells."""
+    """Read ``PITCH.csv``: columns ``z_m,pitch_rad``, as an autocollimator along Z measures it."""
     z, angle = load_columns(path, ("z_m", "pitch_rad"))
     what = f"pitch {str(path)!r}"
     POSITION.checked_all(z, FileError, f"{what}: z_m")

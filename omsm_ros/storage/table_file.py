@@ -58,7 +58,7 @@ def rows_in(source: Any, what: str, remedy: str, **layout: Any) -> FloatArray:
 
     source, layout: as numpy.loadtxt takes them
 
-    Raises FileError, which calls the text ``what`` and tells the ``remedy``, for other lines.
+    Raises FileError, which calls the text ``what`` and names the ``remedy``, for other lines.
     """
     try:
         with warnings.catch_warnings():

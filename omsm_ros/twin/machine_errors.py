@@ -1,4 +1,4 @@
-"""What the machine does that no encoder tells: spindle, slides, drift, pose, mount of the probe.
+"""What the machine does that no encoder sees: spindle, slides, drift, pose, mount of the probe.
 
 Each is a shift of the workpiece against the probe: positive z brings it nearer. Not imitated:
 errors of Y and of the angle of C, roll of the slides, thermal growth that bends the part.
@@ -151,12 +151,12 @@ class Straightness:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineErrors:
-    """All that the machine does and no encoder tells; nothing by default.
+    """All that the machine does and no encoder sees; nothing by default.
 
     pose: of the part on the chuck
-    mount: where the probe truly sits and looks; a correction that is not told it has it as error
+    mount: where the probe truly sits and looks; a correction that does not know it has it as error
     x_slide_along_z: straightness of X towards the probe;  z_slide_along_x: of Z, sideways
-    b_wobble_rad, b_wobble_hz: B swings; its encoder tells
+    b_wobble_rad, b_wobble_hz: B swings; its encoder sees it
     """
 
     pose: PartPose = field(default_factory=PartPose)

@@ -1,4 +1,4 @@
-"""The transfer function that an identification should find, with its parts told apart."""
+"""The transfer function that an identification should find, part by part."""
 
 from __future__ import annotations
 

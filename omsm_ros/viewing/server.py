@@ -27,7 +27,7 @@ _MOST_BYTES_RECEIVED = 1024
 class LiveServer:
     """Serves ``page`` at ``/`` and what is new at ``/live``; each browser has a thread.
 
-    A slow browser is told less often; nothing waits for it, and nothing queues up.
+    A slow browser is updated less often; nothing waits for it, and nothing queues up.
     """
 
     def __init__(self, view: LiveView, page: str, host: str, port: int, token: str = "") -> None:

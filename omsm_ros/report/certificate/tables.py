@@ -246,7 +246,7 @@ def hidden_table(certificate: CertificateEntries) -> Table:
         + known_rows(
             [
                 (
-                    "plateau that would tell the slowest",
+                    "plateau that would show the slowest",
                     quantity(certificate.get("plateau_that_would_tell_s"), "s"),
                     "",
                     "",

@@ -1,4 +1,4 @@
-"""One look for all figures: quiet axes, colours that everybody can tell apart, no global state."""
+"""One look for all figures: quiet axes, colours that everybody can distinguish, no global state."""
 
 from __future__ import annotations
 

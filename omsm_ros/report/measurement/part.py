@@ -32,14 +32,14 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
     """Return the part's deviation, and whether it holds its tolerance; None without a nominal."""
     deviation = part(form, "deviation")
     if deviation:
-        told = [
+        words = [
             f"{name} {_expanded(deviation[key])}"
             for key, name in _FIGURES.items()
             if part(deviation, key, "value") is not None
         ]
-        told += part(form, "removed", "notes") or ()
+        words += part(form, "removed", "notes") or ()
     elif raw := part(summary, "deviation", "corrected"):
-        told = [
+        words = [
             f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",
             f"rms {quantity(raw['rms_area_weighted'], 'm')} by area",
             "uncertainties of these are not evaluated: fit the part's pose, as --fit auto",
@@ -48,14 +48,14 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
         return None
     held = part(summary, "form", "conformity")
     if not held:
-        told.append("no tolerance was given (--tolerance), so it is for you to say")
-        return Verdict("unknown", "Deviation from nominal", tuple(told))
+        words.append("no tolerance was given (--tolerance), so it is for you to say")
+        return Verdict("unknown", "Deviation from nominal", tuple(words))
     level, word = _CONFORMITY[held["verdict"]]
     if level == "good" and part(summary, "light", "level") != "green":
         # The uncertainty of what nobody looked at is not in it.
         level, word = "care", f"By what was evaluated, {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
-    return Verdict(level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(told))
+    return Verdict(level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words))
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
@@ -91,7 +91,7 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
 def settled(form: Mapping[str, Any], name: str) -> float | None:
     """Return the standard uncertainty of a freedom, were those that no points determine held.
 
-    What they would drag along changes no form, and is told by :func:`dragged`.
+    What they would drag along changes no form; :func:`dragged` names it.
     """
     shares: Mapping[str, Mapping[str, float]] = part(form, "removed", "pose_uncertainty") or {}
     refused = part(form, "removed", "not_determined") or ()

@@ -22,7 +22,7 @@ def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
 
     zone: of those that state none; empty = they must
 
-    Raises ValueError, which tells the remedy, for a text that is no such date, or has no zone.
+    Raises ValueError, which names the remedy, for a text that is no such date, or has no zone.
     """
     days, shifts = [], []
     for text in texts:

@@ -236,7 +236,7 @@ class _Rows:
         return [np.ascontiguousarray(next(dates if date else numbers)) for date in self._dates]
 
     def read_dates(self, lines: list[str]) -> list[FloatArray]:
-        """Return the columns of dates; ValueError, which tells the remedy, for other texts."""
+        """Return the columns of dates; ValueError, which names the remedy, for other texts."""
         found = [p for p, date in zip(self._places, self._dates, strict=True) if date]
         cells = [self._table.cells(line) for line in lines] if found else []
         return [seconds_since_1970([c[p] for c in cells], self._form.zone) for p in found]

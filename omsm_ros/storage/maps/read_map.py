@@ -23,7 +23,7 @@ _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
 
 def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
-    """Read a map or cloud of any known format, told by its content; a folder is a result of ours.
+    """Read a map or cloud of any known format, known by its content; a folder is a result of ours.
 
     units: of a file that does not carry them itself
 

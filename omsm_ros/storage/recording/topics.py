@@ -29,7 +29,7 @@ TOPIC_TYPES = {
 }
 
 LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC, PROBE_TOPIC})
-"""Who comes later is told the last message too."""
+"""Who comes later gets the last message too."""
 
 SAMPLES_DEPTH, LATCHED_DEPTH = 2000, 1
 """Messages that a publisher keeps: seconds of blocks; the last one."""
