@@ -50,13 +50,13 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
 
 
 def _command(word: str) -> Command:
-    """The command ``word``; nothing is loaded but what its module needs."""
+    """Return the command ``word``; nothing is loaded but what its module needs."""
     module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
     return next(command for command in module.COMMANDS if command.name == word)
 
 
 def _by_task() -> str:
-    """The commands with what each does, those of one task together."""
+    """Return the commands with what each does, those of one task together."""
     lines = []
     for task, words in TASKS.items():
         lines += ["", f"{task}:"]
@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:
-    """Arguments before and after "--", where the command passes the latter on."""
+    """Return the arguments before and after "--", where the command passes the latter on."""
     if given[0] not in PASS_ON or "--" not in given:
         return given, []
     place = given.index("--")
