@@ -246,7 +246,7 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
 
 
 def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
-    """Return one wide picture: map before in µm, after in nm, identified and true response."""
+    """Draw one wide picture: map before in µm, after in nm, identified and true response."""
     raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
     figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
     return style.png(figure, dpi=120)
@@ -267,7 +267,7 @@ def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
 
 
 def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
-    """Return Bode plot against the truth, and what the model makes of the step test."""
+    """Draw a Bode plot against the truth, and what the model makes of the step test."""
     axes, period = step.axes, calibration.sample_period
     recursion = Recursion(discretise(calibration.dynamics, period))
     recursion.start(past_motion(axes.z[:_REST_SAMPLES]))

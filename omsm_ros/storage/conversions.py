@@ -20,7 +20,7 @@ from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
-from omsm_ros.errors import CalibrationError
+from omsm_ros.errors import CalibrationError, DataError
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import calibration_of
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -84,13 +84,13 @@ def _block_fields(message: Any) -> dict[str, Any]:
 
 
 def axis_block(message: Any) -> AxisBlock:
-    """Record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
+    """Return the record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
     channels = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
     return AxisBlock(**_block_fields(message), **channels)
 
 
 def distance_block(message: Any) -> DistanceBlock:
-    """Record of an ``omsm_msgs/DistanceBlock``; DataError if its channels do not fit."""
+    """Return the record of an ``omsm_msgs/DistanceBlock``; DataError if its channels do not fit."""
     return DistanceBlock(
         **_block_fields(message),
         distance=np.asarray(message.distance, np.float64),
@@ -100,13 +100,13 @@ def distance_block(message: Any) -> DistanceBlock:
 
 
 def acceleration_block(message: Any) -> AccelerationBlock:
-    """Record of an ``omsm_msgs/AccelerationBlock``; DataError if its channels do not fit."""
+    """Return the record of an ``omsm_msgs/AccelerationBlock``; DataError if channels do not fit."""
     channels = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
     return AccelerationBlock(**_block_fields(message), **channels)
 
 
 def calibration(message: Any) -> Calibration:
-    """Record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
+    """Return the record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
 
     The certificate of a set carries the whole set; the other fields are then its middle member's.
     """
@@ -149,10 +149,14 @@ def _json_object(name: str, text: str) -> dict[str, object]:
 
 
 def cloud_array(message: Any) -> NDArray[np.void]:
-    """Return the points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``."""
+    """Return the points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``.
+
+    Raises DataError for a cloud of another layout.
+    """
     if message.point_step != POINT_DTYPE.itemsize or message.is_bigendian:
-        raise CalibrationError(
-            f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}"
+        raise DataError(
+            f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}; give "
+            "one that the corrector published"
         )
     return np.frombuffer(memoryview(message.data), POINT_DTYPE)
 

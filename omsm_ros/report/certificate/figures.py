@@ -38,7 +38,7 @@ _BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
 
 
 def response_with_band(calibration: Calibration, seen: FrequencyResponse | None = None) -> Figure:
-    """Return Bode plot with its 95 % band, and the points of an estimate without a model."""
+    """Draw a Bode plot with its 95 % band, and the points of an estimate without a model."""
     made = bode(calibration, None, calibration.sample_period)
     made.set_size_inches(7.4, 5.45)
     gain, phase, _ = made.get_axes()

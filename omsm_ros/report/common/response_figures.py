@@ -36,7 +36,7 @@ def frequencies(identified: Calibration) -> FloatArray:
 
 
 def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
-    """Return the gain, phase, and the error of a motion before and after the correction.
+    """Draw gain, phase, and the error of a motion before and after the correction.
 
     true: the twin's G_m, drawn where known
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
@@ -162,7 +162,7 @@ def step_response(
     probe: FloatArray,
     predicted: FloatArray | None = None,
 ) -> Figure:
-    """Return one of the steepest moves, an edge of a step test, and how far the probe is from it.
+    """Draw one of the steepest moves, an edge of a step test, and how far the probe is from it.
 
     Each array is of shape (n,), positions in [m].
 

@@ -22,7 +22,7 @@ _LINES = {"profile_x": (0.0, "along x", "x"), "profile_y": (np.pi / 2, "along y"
 
 
 def profiles(found: Comparison) -> dict[str, Figure]:
-    """Return the profiles along x and y through the middle, and the mean over rings, by name."""
+    """Draw the profiles along x and y through the middle, and the mean over rings, by name."""
     matched, agreement = found.matched, found.agreement
     side = matched.grid.dx
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
@@ -82,7 +82,7 @@ def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
 
 
 def terms(numbers: Sequence[TermNumber]) -> Figure:
-    """Return E_n of the Zernike terms of the difference, the bounds at ±1."""
+    """Draw E_n of the Zernike terms of the difference, the bounds at ±1."""
     made, axes = style.figure(6.1, 3.6)
     ax = axes[0, 0]
     values = np.array([term.e_n for term in numbers])

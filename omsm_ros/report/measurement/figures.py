@@ -59,7 +59,7 @@ def deviation_map(
     limits: Limits | None = None,
     quantity: str = "deviation",
 ) -> Figure:
-    """Return a deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
+    """Draw a deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
 
     unit: "nm", "µm" or "mm"
     limits: smallest and largest colour [m]; None: see :func:`symmetric_limits`. Give two
@@ -117,7 +117,7 @@ def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
 def profile(
     raw: Profile, corrected: Profile, *, title: str, position: str, true: Profile | None = None
 ) -> Figure:
-    """Return one profile before and after the correction in µm, and below it what is left in nm.
+    """Draw one profile before and after the correction in µm, and below it what is left in nm.
 
     position: name of the horizontal axis, drawn in mm
     true: the true deviation along the same line, where it is known
@@ -238,7 +238,7 @@ def overview_figure(
     identified: Calibration,
     true: HasResponse | None = None,
 ) -> Figure:
-    """Return one wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
+    """Draw one wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
 
     raw, corrected: deviations (n,) [m] at x, y [m]
     """

@@ -38,7 +38,7 @@ _MOST_NAMED = 8
 
 
 def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
-    """Return the amplitude spectral density of each scan over time, its lines named."""
+    """Draw the amplitude spectral density of each scan over time, its lines named."""
     made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
     for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
         signal = studied.signal
@@ -52,7 +52,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
 
 
 def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
-    """Return the density along the path over wavelength; None where no scan moves over the part."""
+    """Draw the density along the path over wavelength; None where no scan moves over the part."""
     moving = [(s, n) for s, n in scans if PATH in s.coordinates]
     if not moving:
         return None
@@ -103,7 +103,7 @@ def _kinds(axes: Axes, named: Sequence[Named]) -> None:
 
 
 def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:
-    """Return the density of the path's own motion against the calibrated band (Fig. 7c)."""
+    """Draw the density of the path's own motion against the calibrated band (Fig. 7c)."""
     made, axes = style.figure(_WIDTH_IN, 3.0)
     one = axes[0, 0]
     for k, (name, spectrum) in enumerate(spectra):
@@ -119,7 +119,7 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
 
 
 def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
-    """Return every line of every scan at its frequency in time: what stays is no texture.
+    """Draw every line of every scan at its frequency in time: what stays is no texture.
 
     None where there is no such line.
     """
