@@ -142,7 +142,7 @@ def test_repeated_blocks_bring_nothing_new() -> None:
 
 
 def test_too_few_axis_samples_are_refused() -> None:
-    with pytest.raises(DataError, match="long enough"):
+    with pytest.raises(DataError, match="6 axis samples on end"):
         axes_at_probe([], probe_blocks())
 
 
