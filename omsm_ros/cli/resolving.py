@@ -12,7 +12,7 @@ from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
-from omsm_ros.core.verification.resolved_calibration import untold
+from omsm_ros.core.verification.resolved_calibration import undetermined
 from omsm_ros.core.verification.self_calibration import (
     DEFAULT_CLOCKING_RAD,
     DEFAULT_HARMONICS,
@@ -83,7 +83,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "residual": found.residual,
         "left_on_this_surface": found.followed,
         "disagreement": found.agreement.disagreement,
-        "not_told": untold(found),
+        "not_told": undetermined(found),
         "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
         "samples": [account.as_dict() for account in accounts],
         "calibration": str(path),

@@ -145,7 +145,7 @@ class Departures:
 
         That is known only as far as it lasts into the samples compared, and is huge before.
         """
-        return self.problem.moved(self.fitted)
+        return self.problem.output_spectrum(self.fitted)
 
     def time_constants(self) -> FloatArray:
         """Return the time constants [s] that are looked for, up to ``slower`` records."""
@@ -186,10 +186,10 @@ class Departures:
         """Return the sine and cosine at the strongest lines of the residual."""
         used = self.problem.used
         samples = len(used)
-        left = np.zeros(samples)
-        left[used] = self.fitted.residual
+        residual = np.zeros(samples)
+        residual[used] = self.fitted.residual
         length = 4 * fft.next_fast_len(samples, real=True)
-        power = np.abs(fft.rfft(left, length)) ** 2
+        power = np.abs(fft.rfft(residual, length)) ** 2
         # The slowest lines are drift.
         power[: 4 * _FEWEST_PERIODS] = 0.0
         time = np.arange(samples) * self.problem.period

@@ -25,14 +25,14 @@ class FrequencyResponse:
 
 
 def frequency_response(
-    motion: FloatArray, seen: FloatArray, sample_period: float, segment: int
+    motion: FloatArray, output: FloatArray, sample_period: float, segment: int
 ) -> FrequencyResponse:
     """Return H1 = S_yu / S_uu by Welch's method, on increments, in segments of ``segment`` samples.
 
     Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
     that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
     """
-    du, dy = np.diff(motion), np.diff(seen)
+    du, dy = np.diff(motion), np.diff(output)
     rate = 1 / sample_period
     options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
     frequency, cross = signal.csd(du, dy, **options)

@@ -181,15 +181,15 @@ def _best_delay(
     if most == 0:
         return 0
     same = used & (np.arange(len(used)) >= most)
-    left = []
+    sums = []
     for delay in range(most + 1):
         problem = _delayed(input, output, same, period, delay)
         starts = DiscreteStarts(problem.input, problem.output, problem.used, _DELAY_ORDER)
         fits: list[Fit] = []
         for _ in range(_DELAY_ORDER + 1):
             fits.append(_next_order(problem, fits, starts))
-        left.append(fits[-1].sum_of_squares)
-    return int(np.argmin(left))
+        sums.append(fits[-1].sum_of_squares)
+    return int(np.argmin(sums))
 
 
 def _explored(

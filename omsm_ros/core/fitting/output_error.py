@@ -165,10 +165,10 @@ class Problem:
 
     def response(self, fitted: Fit) -> FloatArray:
         """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""
-        spectrum = self.moved(fitted) / fitted.gain
+        spectrum = self.output_spectrum(fitted) / fitted.gain
         return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
 
-    def moved(self, fitted: Fit) -> ComplexArray:
+    def output_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]

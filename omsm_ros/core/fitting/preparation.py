@@ -1,7 +1,7 @@
 """From a record to a problem that can be fitted, or one clear reason why it cannot.
 
 What happens here is decided before any model exists: which samples count, what the probe
-may have seen besides the motion, and whether it saw the motion at all.
+may have measured besides the motion, and whether it followed the motion at all.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
     """Return the problem with what the steps of the probe's readings leave open on plateaus."""
-    plateau, seen = plateaus(steps, problem.used), problem.output[problem.used]
-    shared = plateau_variance(seen, plateau[problem.used], reading_step(seen))
+    plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
+    shared = plateau_variance(output, plateau[problem.used], reading_step(output))
     return replace(problem, plateau=plateau, shared=shared)
 
 
@@ -183,13 +183,13 @@ def check_gain(gain: float) -> None:
 
 
 def _check_not_clipped(problem: Problem) -> None:
-    motion, seen = problem.input[problem.used], problem.output[problem.used]
-    levels = np.unique(seen)
+    motion, output = problem.input[problem.used], problem.output[problem.used]
+    levels = np.unique(output)
     quantum = float(np.min(np.diff(levels)))
-    allowed = max(20 * sample_noise(seen), 3 * quantum, 2e-3 * float(np.ptp(motion)))
+    allowed = max(20 * sample_noise(output), 3 * quantum, 2e-3 * float(np.ptp(motion)))
     for name, extreme in (("greatest", levels[-1]), ("least", levels[0])):
-        there = motion[seen == extreme]
-        near = int(np.sum(np.abs(seen - extreme) < 1.5 * quantum)) - len(there)
+        there = motion[output == extreme]
+        near = int(np.sum(np.abs(output - extreme) < 1.5 * quantum)) - len(there)
         piled = len(there) >= 5 and len(there) > _PILED * near
         if piled and np.ptp(there) > allowed:
             raise IdentificationError(

@@ -55,10 +55,10 @@ class StartingPoints:
 
     @cached_property
     def _probe(self) -> ComplexArray:
-        """Spectrum of what was seen, without background, lost samples taken from the motion."""
+        """Spectrum of the output without background, lost samples taken from the motion."""
         problem, lag = self.problem, self.pure_delay
-        seen = problem.output - problem.background @ lag.background
-        filled = np.where(problem.used, seen, lag.gain * problem.input)
+        output = problem.output - problem.background @ lag.background
+        filled = np.where(problem.used, output, lag.gain * problem.input)
         return problem.closed_spectrum(np.asarray(filled))
 
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:

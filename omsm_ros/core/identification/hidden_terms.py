@@ -302,8 +302,8 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
     shift = omitted(survey, term.columns[:, 0])
     frequency, rms = np.array(PAPER_SCAN).T
     imitated = _relative(fitted, frequency, shift)
-    left = imitated - _departure(term.family, term.parameter, term.damping, frequency)
-    above = float(np.max(np.abs(left))) if term.family == CREEP else 0.0
+    remaining = imitated - _departure(term.family, term.parameter, term.damping, frequency)
+    above = float(np.max(np.abs(remaining))) if term.family == CREEP else 0.0
     return HiddenTerm(
         term.family,
         term.parameter,
@@ -313,7 +313,7 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
         np.zeros_like(shift) if term.family == CREEP else shift,
         np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))]),
         above,
-        float(np.sqrt(np.sum((np.abs(left) * rms) ** 2))),
+        float(np.sqrt(np.sum((np.abs(remaining) * rms) ** 2))),
     )
 
 

@@ -130,16 +130,16 @@ def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
     return np.asarray(cross / norm)
 
 
-def response_agreement(left: FrequencyResponse, up_to: float) -> float:
+def response_agreement(residual: FrequencyResponse, up_to: float) -> float:
     """Return the mean square difference of two responses over its variance, 0 to ``up_to`` [Hz].
 
-    left: response, without a model, of what a model leaves of what was seen. That is the
+    residual: response, without a model, of what a model leaves of the output. That is the
         response of what was seen less that of what was modelled, both through the same
         windows: what these leak of a light mode is in both, and cancels.
     NaN where there is no line.
     """
-    lines = (left.frequency > 0) & (left.frequency <= up_to)
+    lines = (residual.frequency > 0) & (residual.frequency <= up_to)
     if not np.any(lines):
         return float("nan")
     # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
-    return float(np.mean(0.5 / left.uncertainty[lines] ** 2))
+    return float(np.mean(0.5 / residual.uncertainty[lines] ** 2))

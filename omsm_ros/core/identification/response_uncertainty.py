@@ -129,8 +129,8 @@ def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
     # From one end of what is compared to the other, so that no end breaks off.
     taper[compared[0] : compared[-1] + 1] = signal.windows.hann(compared[-1] + 1 - compared[0])
     answer = problem.modelled(best) - problem.background @ best.background
-    seen = best.samples / (compared[-1] + 1 - compared[0])
-    noise = noise_spectrum(best.residual, length) * float(taper @ taper) / seen
+    compared_share = best.samples / (compared[-1] + 1 - compared[0])
+    noise = noise_spectrum(best.residual, length) * float(taper @ taper) / compared_share
     return shown_up_to(
         np.asarray(fft.rfftfreq(length, problem.period)),
         np.asarray(fft.rfft(taper * (answer - np.mean(answer))), np.complex128),

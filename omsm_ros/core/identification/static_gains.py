@@ -47,15 +47,15 @@ def static_gains(record: MotionRecord) -> StaticGains:
     """
     steps = find_steps(record.z, record.sample_period)
     rests = _rests(steps.edges, len(record), round(_SETTLE_S / record.sample_period))
-    probe = np.where(record.ok, record.distance, np.nan)
+    readings = np.where(record.ok, record.distance, np.nan)
     time = _means(np.arange(len(record), dtype=np.float64), rests)
-    encoder, seen = _means(record.z, rests), _means(np.asarray(probe), rests)
+    encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
     if record.reference is None:
-        return StaticGains(_ratio(encoder, seen, time), None, None)
+        return StaticGains(_ratio(encoder, probe, time), None, None)
     reference = _means(record.reference, rests)
     return StaticGains(
-        _ratio(encoder, seen, time),
-        _ratio(reference, seen, time),
+        _ratio(encoder, probe, time),
+        _ratio(reference, probe, time),
         _ratio(encoder, reference, time),
     )
 
@@ -80,13 +80,13 @@ def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
     return np.asarray(means)
 
 
-def _ratio(travel: FloatArray, seen: FloatArray, time: FloatArray) -> Gain:
-    known = np.isfinite(travel) & np.isfinite(seen)
+def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
+    known = np.isfinite(travel) & np.isfinite(other)
     if np.sum(known) < _LEAST_PLATEAUS:
         raise StepTestError(
             f"{int(np.sum(known))!r} plateaus with readings, at least {_LEAST_PLATEAUS} are needed"
         )
-    x, t, y = travel[known], time[known], seen[known]
+    x, t, y = travel[known], time[known], other[known]
     columns = np.column_stack([x - x.mean(), t / t[-1], np.ones(len(x))])
     unit, scale = unit_columns(columns)
     inverse = np.linalg.pinv(unit)

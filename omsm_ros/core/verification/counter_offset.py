@@ -65,10 +65,10 @@ def counter_offset(
             f"{np.count_nonzero(ok)} samples with a distance do not determine an offset of up to "
             f"{most} samples; record {max(_LEAST_SAMPLES, 4 * most)} or more before a fixed target"
         )
-    left = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, most)
-    best = int(np.argmin(left))
-    elsewhere = np.delete(_between(left), np.s_[max(0, best - _FLANK) : best + _FLANK + 1])
-    contrast = float(elsewhere.min() / max(left[best], np.finfo(float).tiny))
+    residual = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, most)
+    best = int(np.argmin(residual))
+    elsewhere = np.delete(_between(residual), np.s_[max(0, best - _FLANK) : best + _FLANK + 1])
+    contrast = float(elsewhere.min() / max(residual[best], np.finfo(float).tiny))
     if contrast < _CONTRAST:
         raise DataError(
             f"the motion fits at several offsets (least residual elsewhere {contrast:.3g} times "
@@ -100,13 +100,13 @@ def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -
     return np.asarray(np.clip(1.0 - shared / np.maximum(vz * vd, np.finfo(float).tiny), 0.0, 1.0))
 
 
-def _between(left: FloatArray) -> FloatArray:
+def _between(residual: FloatArray) -> FloatArray:
     """Return the least residual within a sample of each offset (n,), the vertex of a parabola."""
-    before, here, after = left[:-2], left[1:-1], left[2:]
+    before, here, after = residual[:-2], residual[1:-1], residual[2:]
     bend, tilt = before - 2 * here + after, (after - before) / 2
     inside = (bend > 0) & (abs(tilt) <= bend)
     vertex = here - np.where(inside, tilt**2 / (2 * np.where(inside, bend, 1.0)), 0.0)
-    return np.concatenate([left[:1], np.maximum(vertex, 0.0), left[-1:]])
+    return np.concatenate([residual[:1], np.maximum(vertex, 0.0), residual[-1:]])
 
 
 def _refined(

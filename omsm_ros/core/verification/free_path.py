@@ -47,17 +47,17 @@ def check_path(
     z: encoder [m];  distance: probe on a fixed target [m];  predicted: G_m z [m], all (n,)
     The probe's own view of the motion is -distance / static_gain, apart from its offset.
     """
-    seen = -(distance / static_gain)
-    before = _centred(z - seen)
-    after = _centred(predicted - seen)
+    output = -(distance / static_gain)
+    before = _centred(z - output)
+    after = _centred(predicted - output)
     turning = signal.hilbert(_centred(z))
     phase = np.unwrap(np.angle(turning))
     return PathCheck(
         frequency=np.gradient(phase) / (2 * np.pi * sample_period),
         error_before=before,
         error_after=after,
-        lag_before=_lag(z, seen),
-        lag_after=_lag(predicted, seen),
+        lag_before=_lag(z, output),
+        lag_after=_lag(predicted, output),
         rms_before=float(np.sqrt(np.mean(before**2))),
         rms_after=float(np.sqrt(np.mean(after**2))),
         excited=excited_bands(z, sample_period),

@@ -80,11 +80,11 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     jacobian = slow_motion_jacobian(g)
     prior = jacobian @ sigma @ jacobian.T
     gain = sigma @ jacobian.T @ _inverse_of_what_varies(prior)
-    left = found.covariance[:GAIN, :GAIN].copy()
+    remaining = found.covariance[:GAIN, :GAIN].copy()
     if len(g.numerator) <= CURVATURE + 1:
         # A numerator of the first degree has no room for the curvature: it stays, and counts.
-        left[CURVATURE, CURVATURE] += float(found.values[CURVATURE]) ** 2
-    change = prior - left
+        remaining[CURVATURE, CURVATURE] += float(found.values[CURVATURE]) ** 2
+    change = prior - remaining
     covariance = sigma - gain @ change @ gain.T
     lag = g.low_frequency_delay
     certificate = {
@@ -218,29 +218,29 @@ def _entries(found: SelfCalibration) -> dict[str, object]:
                 }
                 for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
             ],
-            "not_told": untold(found),
+            "not_told": undetermined(found),
         },
     }
 
 
-def untold(found: SelfCalibration) -> list[str]:
+def undetermined(found: SelfCalibration) -> list[str]:
     """Return what the scans did not determine, why, and what would."""
-    told = []
+    words = []
     if not found.known[LATENCY]:
-        told.append(
+        words.append(
             "latency: where Z follows the surface it leaves no trace; a step test "
             "(--calibration) together with these scans tells it"
         )
     if not found.known[CURVATURE]:
-        told.append(
+        words.append(
             "curvature of the gain: the scans run equally fast, so it passes for the surface; "
             "scan at another speed"
         )
-    told.append(
+    words.append(
         "a gain common to all speeds: it scales the surface in every scan alike; only a "
         "reference can tell it"
     )
-    return told
+    return words
 
 
 def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:

@@ -136,14 +136,14 @@ def self_calibrate(
     model = ScanModel(scans, harmonics)
     fit = _Fit(model, prior)
     if not fit.tells:
-        raise DataError(_untold(model, prior))
+        raise DataError(_undetermined(model, prior))
     for index in _MAY_STAY_UNKNOWN:
         if fit.unknown[index]:
             fit = fit.without(index)
     return fit.result()
 
 
-def _untold(model: ScanModel, prior: Prior) -> str:
+def _undetermined(model: ScanModel, prior: Prior) -> str:
     speeds = ", ".join(f"{s * 30 / np.pi:.1f}" for s in model.speeds)
     if prior.clocking > _REMOUNTED_RAD:
         return (

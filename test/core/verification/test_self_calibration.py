@@ -18,8 +18,8 @@ from omsm_ros.core.verification.resolved_calibration import (
     after_step_test,
     from_scans_alone,
     resolved,
+    undetermined,
     unit_calibration,
-    untold,
     without_step_test,
 )
 from omsm_ros.core.verification.scan_model import CURVATURE, GAIN, LAG, LATENCY
@@ -120,7 +120,7 @@ def test_without_a_step_test_the_surface_scanned_is_corrected() -> None:
     assert not found.known[LATENCY]
     structure, uncertainty = found.structure
     assert abs(structure - LAG_S) < 3 * uncertainty < 3e-6
-    assert any("latency" in text for text in untold(found))
+    assert any("latency" in text for text in undetermined(found))
     result = from_scans_alone(found, 1e-3, TRUE_GAIN, {})
     assert latency_of(result).share is None
     assert latency_of(result).uncertainty_s is None
