@@ -101,11 +101,6 @@ class ScanBudget:
             "sources": [row.entry() for row in self.rows],
         }
 
-    @property
-    def not_evaluated(self) -> tuple[str, ...]:
-        """Names of the sources of which nobody knows the size."""
-        return tuple(row.source for row in self.rows if row.status == NOT_EVALUATED)
-
 
 def scan_budget(
     calibration: Calibration,
