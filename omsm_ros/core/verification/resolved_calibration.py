@@ -27,7 +27,7 @@ from omsm_ros.units import RPM_RAD_S
 
 SCOPE = (
     "identified on a surface that Z follows, where latency leaves no trace: the response is that "
-    "of the structure, for surfaces followed as closely; a step test besides tells the latency"
+    "of the structure, for surfaces followed as closely; a step test would determine the latency"
 )
 # One clean run in a thousand.
 _SURPRISE_P, _SURPRISE_SIGMAS = 1e-3, 3.0
@@ -229,7 +229,7 @@ def undetermined(found: SelfCalibration) -> list[str]:
     if not found.known[LATENCY]:
         words.append(
             "latency: where Z follows the surface it leaves no trace; a step test "
-            "(--calibration) together with these scans tells it"
+            "(--calibration) together with these scans determines it"
         )
     if not found.known[CURVATURE]:
         words.append(
@@ -238,7 +238,7 @@ def undetermined(found: SelfCalibration) -> list[str]:
         )
     words.append(
         "a gain common to all speeds: it scales the surface in every scan alike; only a "
-        "reference can tell it"
+        "reference determines it"
     )
     return words
 
