@@ -72,7 +72,7 @@ class Channels(NamedTuple):
 
 
 def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
-    """Axes whose encoders wrap after ``counts`` where nothing else is said."""
+    """Return the axes; their encoders wrap after ``counts`` where nothing else is said."""
     if axes is None:
         return None
     return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)

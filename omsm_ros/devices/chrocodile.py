@@ -167,7 +167,7 @@ class Chrocodile(StreamDevice):
         return super().counts() | flags
 
     def poll(self, timeout: float) -> list[BlockPair]:
-        """As of every device; one that averages without slowing down is set up anew."""
+        """Return what came, as any device; one averaging at the same rate is set up anew."""
         blocks = super().poll(timeout)
         self._unheard &= not blocks
         faster = (1 + self._cutter.period_deviation) * self._exposures

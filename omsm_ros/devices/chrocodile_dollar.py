@@ -98,7 +98,7 @@ class ChrocodileDevice(Chrocodile):
             )
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
-        """The answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
+        """Return the answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
         return self._exchange(command(name, *arguments), patience)
 
     def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:

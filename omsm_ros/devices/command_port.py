@@ -44,7 +44,7 @@ class CommandPort:
         self._transport.close()
 
     def ask(self, text: str, end: str, sign: bytes = b"") -> str:
-        """The answer to ``text``, its echo and prompt included; DeviceTimeoutError if none.
+        """Return the answer to ``text``, its echo and prompt included; DeviceTimeoutError if none.
 
         sign: a regular expression for what every answer to it holds; a prompt before it is a
         late one, of something else. Without it in all the time, the last prompt counts.

@@ -151,7 +151,7 @@ class Believed:
         self._confirmed = False
 
     def feed(self, values: IntArray, spoilt: IntArray) -> tuple[IntArray, IntArray]:
-        """Of what :meth:`SerialDecoder.feed` returned, and of what waited, what to believe."""
+        """Return what to believe of what :meth:`SerialDecoder.feed` returned and of what waited."""
         found: list[tuple[IntArray, IntArray]] = []
         breaks = np.flatnonzero(spoilt)
         edges = np.unique(np.concatenate([[0], breaks, [len(values)]]))

@@ -70,7 +70,7 @@ class Block(NamedTuple):
 
 
 def confocal_dtype(flags: tuple[int, int]) -> np.dtype[np.void]:
-    """What the flags of a confocalDT say a frame holds; ProtocolError if it has no distance.
+    """Return what the flags of a confocalDT say a frame holds; ProtocolError without a distance.
 
     Of a peak with intensity, the two words may stand in either order: see ``intensity_leads``.
     """
@@ -96,7 +96,7 @@ def _format(name: str, size: int) -> str:
 
 
 def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
-    """Whether the first of a peak's two ``words`` (n, 2) is the intensity; None if nothing tells.
+    """Return whether the first of a peak's ``words`` (n, 2) is the intensity; None if unknown.
 
     One manual draws the distance first, others name the intensity first. The words tell: in an
     intensity bits 11 to 15, 30 and 31 are zero; a distance is at most ``furthest`` [nm], or an
