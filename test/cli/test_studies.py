@@ -33,6 +33,23 @@ def test_predict_says_what_the_scan_will_cost(capsys, small_scan, scan_bag, cali
     assert found["outside_band_fraction"] < 0.02
 
 
+def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
+    capsys, tmp_path, small_scan, calibration
+):
+    path, kept = tmp_path / "gap.mcap", 0
+    with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
+        for axes, _ in blocks_of(small_scan, 1000):
+            if axes.first_sample != 2000:
+                bag.write_axes(axes)
+                kept += len(axes)
+    found = facts(capsys, "predict", path, "--calibration", calibration)
+    truth = (small_scan.probe_motion - small_scan.axes.z)[3000:]
+    assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
+    assert "1 000 are missing (2000 to 2999)" in found["left_out"]
+    assert f"judged are only {kept - 2000:,} of {kept:,}".replace(",", " ") in found["left_out"]
+    assert found["message"].endswith(found["left_out"])
+
+
 def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
     assert cli.main(["plan", "steps", "--out", str(tmp_path), "--json"]) == 0
     capsys.readouterr()

@@ -27,6 +27,7 @@ SAMPLES = round(MINUTES * 60_000)
 DEVICE_PORT = 17_000 + os.getpid() % 1000
 NODES = ("confocal_driver", "corrector", "calibrator", "recorder")
 MOST_GROWTH = 0.01
+LONGEST_FAULT_S = 3.0
 
 
 def resident_bytes(pid):
@@ -148,8 +149,11 @@ def test_an_hour_with_a_fault_every_minute(cell, true_calibration):
         hour.start()
         lasting, killed = hour.faults()
         both = itertools.chain.from_iterable(zip(itertools.cycle(killed), itertools.cycle(lasting)))
-        # Memory is that of one life: half of the time nodes are killed, then they live on.
-        before = strike(hour, both, SAMPLES // 2)
+        # Memory is that of one life, in which queues have filled and each fault was met once: nodes
+        # are killed for a third of the time, then they live on.
+        round_of_all = round(len(lasting) * (FAULT_PERIOD_S + LONGEST_FAULT_S) * 1000)
+        strike(hour, both, SAMPLES // 2 - round_of_all)
+        before = strike(hour, lasting, SAMPLES)
         after = strike(hour, itertools.cycle(lasting), SAMPLES - round(FAULT_PERIOD_S * 1000))
         cell.operator.wait_until("the end", lambda: hour.played >= SAMPLES, lambda: hour.played)
         growth = {node: after[node] / before[node] - 1 for node in NODES}
@@ -161,10 +165,12 @@ def test_an_hour_with_a_fault_every_minute(cell, true_calibration):
 
 
 def strike(hour, faults, until):
-    """Let faults come until so many samples are played; resident memory then, by node."""
-    while hour.played < until:
+    """Let faults come until so many samples are played, or all came; resident memory then."""
+    for fault in faults:
+        if hour.played >= until:
+            break
         hour.pass_by(FAULT_PERIOD_S)
-        next(faults)()
+        fault()
         print(hour.played, memory(hour), flush=True)
     hour.pass_by(5.0)
     return memory(hour)

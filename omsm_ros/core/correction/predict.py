@@ -54,6 +54,7 @@ class Prediction:
         0 if it may not be run at any speed
     safe: no limit is exceeded;  binding: name of the limit that is reached first
     limits: all that were evaluated, that of the dynamics first;  not_evaluated: the others
+    left_out: samples of the recording that were not judged, in words; empty if all were
     message: the same for a reader
     """
 
@@ -67,6 +68,7 @@ class Prediction:
     binding: str
     limits: tuple[SpeedLimit, ...]
     not_evaluated: tuple[str, ...]
+    left_out: str
     message: str
 
 
@@ -92,6 +94,7 @@ def predict_error(
     )
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
+    message = _message(calibration, spread, (dynamics.value, hidden), budget, binding)
     return Prediction(
         peak_to_valley=spread,
         rms=float(np.std(error)),
@@ -103,7 +106,8 @@ def predict_error(
         binding=binding.name,
         limits=every,
         not_evaluated=tuple(missing),
-        message=_message(calibration, spread, (dynamics.value, hidden), budget, binding),
+        left_out=path.left_out,
+        message="; ".join(filter(None, (message, path.left_out))),
     )
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.readable import count
 
+_MOST_NAMED = 3
 # What the samples hold above it is the encoder's noise rather than the path.
 _CONTENT_SHARE = 0.999
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
@@ -20,6 +24,7 @@ class ScanPath:
     """A path over time: z [m] (n,), and what else is known of it, each (n,) or None.
 
     x: [m];  c: [rad];  distance: of a recorded scan [m], NaN where the probe lost the surface
+    left_out: which samples of the recording are none of the path, and why; empty if all are
     """
 
     z: FloatArray
@@ -27,6 +32,7 @@ class ScanPath:
     x: FloatArray | None = None
     c: FloatArray | None = None
     distance: FloatArray | None = None
+    left_out: str = ""
 
 
 class PathStart:
@@ -40,20 +46,25 @@ class PathStart:
         """``most`` samples of either stream are kept."""
         self._most = most
         self._runs: list[list[AxisBlock]] = []
-        self._kept = self._readings_kept = 0
+        self._kept = self._passed = self._readings_kept = 0
         self._readings: list[tuple[int, FloatArray]] = []
 
     def add(self, block: Block) -> None:
         """Take what is still wanted of ``block``."""
-        if isinstance(block, AxisBlock) and self._kept < self._most:
-            if not self._runs or not _continues(self._runs[-1][-1], block):
-                self._runs.append([])
-            self._runs[-1].append(block)
-            self._kept += len(block)
+        if isinstance(block, AxisBlock):
+            self._passed += len(block)
+            if self._kept < self._most:
+                self._keep(block)
         elif isinstance(block, DistanceBlock) and self._readings_kept < self._most:
             readings = np.where(block.ok, block.distance, np.nan)
             self._readings.append((block.first_sample, readings))
             self._readings_kept += len(block)
+
+    def _keep(self, block: AxisBlock) -> None:
+        if not self._runs or _break(self._runs[-1][-1], block):
+            self._runs.append([])
+        self._runs[-1].append(block)
+        self._kept += len(block)
 
     def path(self) -> ScanPath | None:
         """Return the path gathered so far; None if there were no axes."""
@@ -61,15 +72,49 @@ class PathStart:
             return None
         run = max(self._runs, key=lambda run: sum(map(len, run)))
         z, x, c = (np.concatenate([getattr(b, name) for b in run])[: self._most] for name in "zxc")
-        first, end = run[0].first_sample, run[-1].end
+        first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
         within = [readings for at, readings in self._readings if first <= at < end]
         distance = np.concatenate(within)[: self._most] if within else None
-        return ScanPath(z=z, sample_period=run[0].sample_period, x=x, c=c, distance=distance)
+        return ScanPath(
+            z=z,
+            sample_period=run[0].sample_period,
+            x=x,
+            c=c,
+            distance=distance,
+            left_out=self._left_out(first, len(z)),
+        )
+
+    def _left_out(self, first: int, judged: int) -> str:
+        breaks = [_break(before[-1], after[0]) for before, after in pairwise(self._runs)]
+        if judged == self._passed and not breaks:
+            return ""
+        text = (
+            f"judged are only {count(judged)} of {count(self._passed)} samples, triggers {first} "
+            f"to {first + judged - 1}"
+        )
+        if breaks:
+            text += f", the longest run without a gap: {_named(breaks)}"
+        if self._passed > self._most:
+            text += f"; no more than the first {count(self._most)} are looked at"
+        return text
 
 
-def _continues(last: AxisBlock, block: AxisBlock) -> bool:
-    same_period = abs(block.sample_period / last.sample_period - 1) < SAME_PERIOD
-    return same_period and block.first_sample == last.end
+def _named(breaks: Sequence[str]) -> str:
+    rest = len(breaks) - _MOST_NAMED
+    return ", ".join(breaks[:_MOST_NAMED]) + (f" and {rest} more gaps" if rest > 0 else "")
+
+
+def _break(last: AxisBlock, block: AxisBlock) -> str:
+    """Return in words what parts two blocks; empty if one continues the other."""
+    end = last.first_sample + len(last)
+    missing = block.first_sample - end
+    if missing > 0:
+        return f"{count(missing)} are missing ({end} to {block.first_sample - 1})"
+    if missing < 0:
+        return f"after {end - 1} the counter goes on from {block.first_sample}"
+    if abs(block.sample_period / last.sample_period - 1) >= SAME_PERIOD:
+        return f"from {end} on the sample period is {block.sample_period:.6g} s"
+    return ""
 
 
 def content_frequency(z: FloatArray, sample_period: float) -> float:
