@@ -80,6 +80,19 @@ DEBUG = "OMSM_DEBUG"
 """Environment variable that, when set, shows the traceback of a defect."""
 
 
+_LONGEST_LINE = 1500
+
+
+def one_line(text: object) -> str:
+    """Return what an error says in one line that has an end: its middle goes, not the remedy.
+
+    Names and words in it come from outside, and may have any length.
+    """
+    line = " ".join(str(text).split())
+    half = _LONGEST_LINE // 2
+    return line if len(line) <= _LONGEST_LINE else f"{line[:half]} … {line[-half:]}"
+
+
 def defect(err: BaseException) -> str:
     """Return one line about an exception that nobody foresaw: what to report, and how."""
     trace = err.__traceback__

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from omsm_ros import __version__, quantities
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.words import TASKS, WORDS
-from omsm_ros.errors import DEBUG, OmsmError, defect
+from omsm_ros.errors import DEBUG, OmsmError, defect, one_line
 from omsm_ros.storage import strict_json
 
 if TYPE_CHECKING:  # it would load what reads bags, for a list of words
@@ -24,7 +24,6 @@ if TYPE_CHECKING:  # it would load what reads bags, for a list of words
 
 DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
 
-_LONGEST_LINE = 1500
 _WIDTH, _INDENT = 79, 14
 
 DEMO = "demo"
@@ -194,7 +193,4 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _say(text: str) -> None:
-    line = " ".join(text.split())
-    if len(line) > _LONGEST_LINE:  # a path of thousands of characters; the remedy stands last
-        line = f"{line[: _LONGEST_LINE // 2]} … {line[-_LONGEST_LINE // 2 :]}"
-    print("omsm:", line, file=sys.stderr)
+    print("omsm:", one_line(text), file=sys.stderr)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import queue
 import threading
 from collections.abc import Awaitable, Callable
@@ -21,6 +23,8 @@ T = TypeVar("T")
 
 # As many may wait; who comes then is answered at once, that he has to come again.
 _MOST_WAITING = 8
+# Without work, until its memory is given back.
+_IDLE_S = 1.0
 
 
 class Aside:
@@ -73,12 +77,36 @@ class Aside:
         undo.callback(self._node.destroy_service, made)
 
     def _run(self) -> None:
-        while (task := self._work.get()) is not None:
-            work, done = task
+        patience: float | None = None
+        while True:
             try:
-                done.set_result(work())
-            except Exception as err:  # told by who awaits it
-                done.set_exception(err)
-            # The executor looks at who waits only when something else wakes it.
-            if (executor := self._node.executor) is not None:
-                executor.wake()
+                task = self._work.get(timeout=patience)
+            except queue.Empty:
+                _give_memory_back()
+                patience = None
+                continue
+            if task is None:
+                return
+            self._do(*task)
+            del task  # with what it has found
+            patience = _IDLE_S
+
+    def _do(self, work: Callable[[], Any], done: Future) -> None:
+        try:
+            done.set_result(work())
+        except Exception as err:  # told by who awaits it
+            done.set_exception(err)
+        # The executor looks at who waits only when something else wakes it.
+        if (executor := self._node.executor) is not None:
+            executor.wake()
+
+
+def _give_memory_back() -> None:
+    """Return to the system what work of hundreds of megabytes has left free.
+
+    The C library keeps it, or else a node has for good the memory of its largest request.
+    """
+    gc.collect()  # of what failed, the traceback holds all
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
+    if trim is not None:
+        trim(0)

@@ -15,7 +15,7 @@ from omsm_msgs.msg import Calibration as CalibrationMessage
 from rclpy.node import Node
 
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.errors import OmsmError
+from omsm_ros.errors import OmsmError, one_line
 from omsm_ros.nodes import topics
 from omsm_ros.storage import conversions
 
@@ -75,9 +75,9 @@ class CalibrationTopic:
             heard = conversions.calibration(message)
             self._take(heard, since_ns)
         except OmsmError as err:
-            self.refused = str(err)
+            self.refused = one_line(err)
             self._node.get_logger().error(
-                f"calibration refused: {err}", throttle_duration_sec=_COMPLAINT_PERIOD_S
+                f"calibration refused: {self.refused}", throttle_duration_sec=_COMPLAINT_PERIOD_S
             )
             self._insist()
             return

@@ -24,7 +24,7 @@ from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
-from omsm_ros.errors import ConfigurationError, FileError, OmsmError
+from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
 from omsm_ros.jobs.remember import remembered
 from omsm_ros.nodes.aside import Aside
@@ -161,7 +161,7 @@ class CalibratorNode(ManagedNode):
                 said = await self._aside.do(partial(self._certified, request.bag, identified))
                 self._last += said
         except OmsmError as err:
-            response.success, self._last = False, f"identification failed: {err}"
+            response.success, self._last = False, f"identification failed: {one_line(err)}"
         if response.success:
             self.get_logger().info(self._last)
         else:

@@ -23,7 +23,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from omsm_ros.errors import OmsmError
+from omsm_ros.errors import OmsmError, one_line
 from omsm_ros.nodes import topics
 from omsm_ros.nodes.declared import Declared
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, survive
@@ -150,7 +150,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         except Exception as err:
             self._failure = err
             if isinstance(err, OmsmError):
-                self.get_logger().error(f"{type(err).__name__}: {' '.join(str(err).split())}")
+                self.get_logger().error(f"{type(err).__name__}: {one_line(err)}")
             else:
                 survive(self, err)
             undo.close()
@@ -214,7 +214,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if self.stage is not Stage.ACTIVE:
             report.add(WARN, f"{self.stage.value}: it does nothing until it is activated")
         if self._failure is not None:
-            report.add(ERROR, str(self._failure))
+            report.add(ERROR, one_line(self._failure))
         for publisher in self._outputs:
             if (count := self.count_publishers(publisher.topic_name)) > 1:
                 report.add(

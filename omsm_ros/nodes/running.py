@@ -20,7 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect
+from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
 from omsm_ros.nodes.start import ENDING, nothing_to_undo
@@ -74,7 +74,7 @@ def _give_up(node: ManagedNode | None, err: Exception) -> None:
     if os.environ.get(DEBUG) and not known:
         raise err
     if node is None:
-        text = f"{type(err).__name__}: {' '.join(str(err).split())}" if known else defect(err)
+        text = f"{type(err).__name__}: {one_line(err)}" if known else defect(err)
         print(text, file=sys.stderr)
     else:  # the line is in the log already
         time.sleep(_LAST_WORDS_S if node.count_subscribers("/rosout") else 0.0)
@@ -171,4 +171,4 @@ def refuse(response: Any, reason: str) -> None:
     for name in ("success", "safe"):
         if hasattr(response, name):
             setattr(response, name, False)
-    response.message = reason
+    response.message = one_line(reason)

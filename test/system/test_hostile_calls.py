@@ -56,6 +56,8 @@ def test_hostile_calls_are_answered_and_survived(cell, files):
         answer = cell.call(PredictError, "corrector/predict_error", z=z, sample_period=1e-3)
         assert not answer.safe
         assert answer.message
+    answer = cell.call(Identify, "calibrator/identify", input="x" * 100_000)
+    assert len(answer.message) < 2000
     for order in (21, 2**31, 2**32 - 1):
         assert not cell.call(Identify, "calibrator/identify", order=order).success
     answer = cell.call(PredictError, "corrector/predict_error", z=WAVE, sample_period=1e-3)
