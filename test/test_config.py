@@ -1,6 +1,7 @@
 """The shipped YAML files name exactly the parameters that the nodes declare."""
 
 import importlib
+import json
 import re
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import pytest
 import yaml
 
 import omsm_ros
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.devices import factory, sensor_factory
+from omsm_ros.storage.recording.topics import POINTS_TOPIC, TOPIC_TYPES
 from omsm_ros.storage.surface_file import load_surface
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
@@ -86,3 +89,21 @@ def test_every_node_can_be_started_by_its_name():
     named = set(re.findall(r'"(\w+)"', listed))
     nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
     assert named == nodes
+
+
+def test_the_layouts_for_viewers_name_what_is_published():
+    rviz = yaml.safe_load((ROOT / "config" / "cell.rviz").read_text())["Visualization Manager"]
+    assert rviz["Global Options"]["Fixed Frame"] == "workpiece"
+    (cloud,) = (shown for shown in rviz["Displays"] if shown["Class"].endswith("/PointCloud2"))
+    assert cloud["Topic"]["Value"] == POINTS_TOPIC
+    fields = {name for name, _ in CLOUD_FIELDS}
+    assert cloud["Channel Name"] in fields
+    panels = json.loads((ROOT / "config" / "cell.foxglove.json").read_text())["configById"]
+    assert panels["3D!surface"]["followTf"] == "workpiece"
+    assert {p["colorField"] for p in panels["3D!surface"]["topics"].values()} <= fields
+    assert set(panels["3D!surface"]["topics"]) == {POINTS_TOPIC}
+    for path in panels["Plot!axes"]["paths"]:
+        topic, field = re.fullmatch(r"(/\w+/\w+)\.(\w+)\[0\]", path["value"]).groups()
+        kind = TOPIC_TYPES[topic].rpartition("/")[2]
+        assert f"float64[] {field}" in (ROOT / "msg_defs" / "msg" / f"{kind}.msg").read_text()
+    assert panels["DiagnosticSummary!nodes"]["topicToRender"] == "/diagnostics"
