@@ -90,6 +90,7 @@ SURFACES: tuple[dict[str, Any], ...] = (
     {"shape": "zernike", "radius": 6e-3, "coefficients": [0, 0, 0, 1e-6, 1e-7, 1e-8]},
     {"shape": "zernike", "radius": 6e-3, "coefficients": [1e-7] * 9, "indexing": "noll"},
     {"shape": "q_bfs", "aperture_radius": 6e-3, "radius": 0.1, "coefficients": [1e-6, 1e-7]},
+    {"shape": "q_freeform", "aperture_radius": 6e-3, "terms": [{"n": 1, "m": -2, "value": 1e-6}]},
     {"shape": "q_con", "aperture_radius": 6e-3, "radius": 0.1, "coefficients": [1e-6, 1e-7]},
     {"shape": "off_axis_section", "parent": {"shape": "sphere", "radius": 0.1}, "distance": 0.02},
     {"shape": "sum", "parts": [{"shape": "flat"}, {"shape": "sphere", "radius": 0.2}]},

@@ -16,6 +16,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
 from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, ZernikeSurface
 from omsm_ros.core.surface.posed import OffAxisSection, Sum
+from omsm_ros.core.surface.q_freeform import QFreeform
 from omsm_ros.core.surface.slopes import Gradient
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import FOCAL_LENGTH, LENGTH, RADIUS
@@ -121,6 +122,7 @@ SHAPES: dict[str, Callable[..., Surface]] = {
     "zernike": ZernikeSurface,
     "q_bfs": QBfs,
     "q_con": QCon,
+    "q_freeform": QFreeform,
     "off_axis_section": OffAxisSection,
     "sum": Sum,
 }

@@ -8,6 +8,7 @@ from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
 from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, XYTerm, ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid, Sphere
 from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
+from omsm_ros.core.surface.q_freeform import QFreeform, QTerm
 from omsm_ros.core.surface.slopes import gradient_of
 from omsm_ros.errors import SurfaceError
 
@@ -27,6 +28,11 @@ SHAPES = {
     "zernike": ZernikeSurface(0.01, tuple(RNG.normal(0, 1e-6, 37)), "noll", "rms"),
     "q_bfs": QBfs(0.01, (1e-6, 2e-6, -1e-6, 3e-6), 0.05),
     "q_con": QCon(0.01, (1e-6, 2e-6, -1e-6), 0.05, -1.2),
+    "q_freeform": QFreeform(
+        0.01,
+        (QTerm(0, 2, 2e-6), QTerm(3, -1, 1e-6), QTerm(2, 0, 5e-7), QTerm(4, 7, -1e-6)),
+        0.05,
+    ),
     "section": OffAxisSection(Asphere(0.08, -0.6, (0.0, 50.0)), 0.03, 0.7),
     "posed": PosedSurface(PAPER_MIRROR, POSE),
     "sum": Sum((Sphere(0.1), XYPolynomial(0.01, (XYTerm(1, 2, 1e-6),)))),
@@ -193,6 +199,49 @@ def test_slopes_of_bfs_are_orthonormal():
     np.testing.assert_allclose(gram / gram[0, 0], np.eye(7), atol=1e-12)
 
 
+def test_freeform_terms_are_orthonormal_in_the_gradient():
+    """2012, sec. 3: the mean of ∇S_i·∇S_j is δ_ij, with weight 1/√(1 − u²) over u, even over θ."""
+    angle, around = np.meshgrid((np.arange(40) + 0.5) * np.pi / 80, np.arange(32) * np.pi / 16)
+    u = np.sin(angle)
+    x, y, step = u * np.cos(around), u * np.sin(around), 1e-3
+    terms = [QTerm(n, m, 1.0) for m in (0, 1, -1, 2, 3, -8) for n in range(5)]
+
+    def slope(surface, dx, dy):
+        """Differences of the eighth order of the height alone."""
+        weights = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+        return sum(
+            w * (surface.height(x + k * dx, y + k * dy) - surface.height(x - k * dx, y - k * dy))
+            for k, w in enumerate(weights, 1)
+        ) / (dx + dy)
+
+    made = [QFreeform(1.0, (term,)) for term in terms]
+    slopes = np.array([[slope(s, step, 0.0), slope(s, 0.0, step)] for s in made])
+    flat = slopes.reshape(len(terms), -1)
+    np.testing.assert_allclose(flat @ flat.T / x.size, np.eye(len(terms)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 1), (3, 1), (2, 2), (5, 4), (12, 9)])
+def test_a_freeform_term_is_a_polynomial_of_its_degree_with_alternating_sign(n, m):
+    """What the gradient leaves open: the degree in u², and the sign of its highest power."""
+    x = np.linspace(0.05, 1, n + 3)
+    along = QFreeform(1.0, (QTerm(n, m, 1.0),)).height(np.sqrt(x), 0 * x) / np.sqrt(x) ** m
+    differences = np.diff(along, n)
+    assert np.all(differences * (-1) ** n > 0)
+    assert np.ptp(differences) < 1e-6 * np.max(np.abs(differences))
+
+
+def test_freeform_terms_without_an_angle_are_those_of_bfs_and_sines_are_cosines_turned():
+    sizes = (1e-6, -2e-6, 3e-6)
+    terms = tuple(QTerm(n, 0, size) for n, size in enumerate(sizes))
+    one, other = QFreeform(0.01, terms, -0.07), QBfs(0.01, sizes, -0.07)
+    np.testing.assert_allclose(one.height(X, Y), other.height(X, Y), rtol=1e-13)
+    cosine, sine = (QFreeform(0.01, (QTerm(2, m, 1e-6),), 0.05) for m in (3, -3))
+    # A sixth of a turn of three lobes by half a lobe: x to y.
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    turned = sine.height(c * X - s * Y, s * X + c * Y)
+    np.testing.assert_allclose(turned, cosine.height(X, Y), atol=1e-19)
+
+
 @pytest.mark.parametrize(
     ("make", "named"),
     [
@@ -209,6 +258,9 @@ def test_slopes_of_bfs_are_orthonormal():
         (lambda: Pose(tip=4.0), "tip is 4.0 rad"),
         (lambda: Sum(()), "no parts"),
         (lambda: QBfs(-1.0, ()), "aperture_radius"),
+        (lambda: QFreeform(0.01, (), 0.0), "radius is 0.0 m"),
+        (lambda: QTerm(21, 0, 1e-6), "degree n is 21"),
+        (lambda: QTerm(0, -21, 1e-6), "angular order"),
     ],
 )
 def test_what_nobody_makes_is_refused_by_name(make, named):
