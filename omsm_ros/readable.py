@@ -20,6 +20,7 @@ _FIGURES = {
     "robust_peak_to_valley": "PV of 99.5 %",
     "peak_to_valley": "PV",
     "iso10110": "ISO 10110",
+    "_best_fit": ", best fit of the pose",
 }
 _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -94,14 +94,15 @@ def _advice(form: Form) -> list[str]:
         fitted = []
     advice = [
         f"a move along {' and '.join(fitted)} looks like form here, and was fitted, so that little "
-        "is known of form that looks so; if the part was not moved since it was cut, hold it: "
-        "--fit piston,tip,tilt"
+        "is known of form that looks so; the figures of the best fit hold all the same; if the "
+        "part was not moved since it was cut, hold it: --fit piston,tip,tilt"
     ] * bool(fitted)
     if freedoms.held:
         others = ",".join(n for n in freedoms.fitted if n not in freedoms.held)
         advice.append(
             f"{' and '.join(freedoms.held)} held as in the nominal pose, for form looks like a "
-            "move there; how far the part may be off all the same is in every uncertainty; if it "
+            "move there; how far the part may be off all the same is in every uncertainty but "
+            "those of the best fit, which no move changes; if it "
             f"is known to sit within a micrometre, name what to fit: --fit {others}"
         )
     return advice

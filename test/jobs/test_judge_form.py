@@ -111,6 +111,29 @@ def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(fold
     assert entry["uncertainty"] == pytest.approx(np.pi / 180)
 
 
+def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp_path):
+    """Against least squares of the truth by differences of the twin's own part in six poses."""
+    _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
+    figures = json.loads(path.read_text())["deviation"]
+    r, angle = RADIUS * np.sqrt(np.linspace(0, 1, 5000)), np.arange(5000) * 2.4
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    small = {"x_m": 1e-6, "y_m": 1e-6, "tilt_x_rad": 1e-5, "tilt_y_rad": 1e-5, "z_m": 1e-6}
+    there = PAPER_MIRROR.height(x, y)
+    moves = [
+        (posed(PAPER_MIRROR, PartPose(**{name: size})).height(x, y) - there) / size
+        for name, size in small.items()
+    ]
+    design = np.stack(moves, axis=1) / np.linalg.norm(moves, axis=1)
+    true = Mirror.error.height(x, y)
+    rest = true - design @ np.linalg.lstsq(design, true, rcond=None)[0]
+    rms, extent = figures["rms_best_fit"], figures["peak_to_valley_best_fit"]
+    assert np.std(rest) < 0.5 * np.std(true)
+    assert abs(rms["value"] - np.std(rest)) < 3 * rms["uncertainty"] + 0.015 * np.std(rest)
+    assert abs(extent["value"] - np.ptp(rest)) < 3 * extent["uncertainty"]
+    assert rms["uncertainty"] < 0.5e-9
+    assert extent["uncertainty"] < 5e-9 < figures["peak_to_valley"]["uncertainty"]
+
+
 def test_people_read_the_figures_too(folder, tmp_path, capsys):
     form(folder, tmp_path, "--fit", "piston,tip,tilt")
     said = capsys.readouterr().out

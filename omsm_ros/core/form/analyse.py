@@ -18,7 +18,7 @@ from omsm_ros.core.form.optical_terms import optical_terms
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.form.power_density import Curve, PowerDensity, power_density
 from omsm_ros.core.form.profiles import profiles
-from omsm_ros.core.form.removal import without_form, without_second_order
+from omsm_ros.core.form.removal import best_fit, without_form, without_second_order
 from omsm_ros.core.form.texture import Bands, bands_of, texture
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
@@ -118,10 +118,13 @@ def analyse_form(
 def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> dict[str, Figure]:
     rest = without_second_order(map_)
     whole, robust = extents_of_part(map_, found.disc)
+    fitted = best_fit(map_)
     return {
         "peak_to_valley": whole,
         "robust_peak_to_valley": robust,
         "rms": rms_of_part(map_),
+        "peak_to_valley_best_fit": extents_of_part(fitted, found.disc)[0],
+        "rms_best_fit": rms_of_part(fitted),
         "peak_to_valley_without_second_order": extents_of_part(rest, found.disc)[0],
         "rms_without_second_order": rms_of_part(rest),
         # As measured: what errors have added is in them.
@@ -206,4 +209,5 @@ class _Gathered:
             noise=min(float(np.median(self._noise)), noise_beside(*rows[:3]), found.noise),
             # The sources' effects stand behind those of the pose.
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
+            moves=found.moves,
         )

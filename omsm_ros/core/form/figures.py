@@ -31,6 +31,7 @@ class DeviationMap:
     effects: what each independent source of error, off by its standard uncertainty, does to the
         deviations (e, n) [m]
     bounds: which of the effects are upper bounds of errors that may not be there at all
+    moves: which of them are of a part that sits elsewhere, in the first order
     noise: standard deviation of one point [m]
     """
 
@@ -41,6 +42,7 @@ class DeviationMap:
     effects: FloatArray
     noise: float
     bounds: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    moves: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -53,6 +55,7 @@ class DeviationMap:
             effects=self.effects[:, chosen],
             noise=self.noise,
             bounds=self.bounds,
+            moves=self.moves,
         )
 
 

@@ -31,6 +31,17 @@ def without(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     return replace(map_, deviation=rest[0], effects=rest[1:])
 
 
+def best_fit(map_: DeviationMap) -> DeviationMap:
+    """Return the map where the part sits as it fits best, in all that was fitted or held.
+
+    What no move of the part explains: however it sat, so much deviates. Form that looks like a move
+    is not in it, and neither is what the pose leaves open.
+    """
+    moves = map_.effects[map_.moves]
+    size = np.sqrt(np.mean(moves**2, axis=1))
+    return without(map_, moves[size > 0] / size[size > 0, np.newaxis])
+
+
 def without_second_order(map_: DeviationMap) -> DeviationMap:
     """Return the map without its best ``Σ c_ij x^i y^j``, i + j ≤ 2."""
     u, v = (_scaled(values) for values in (map_.x, map_.y))

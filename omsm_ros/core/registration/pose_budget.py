@@ -19,7 +19,7 @@ from omsm_ros.core.registration.placement import (
     freedom_columns,
     placed,
 )
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,6 +68,17 @@ class Registration:
         held = effects_of_held(self.surface, self.placement, points, names, self.held_effects)
         sources = np.concatenate([systematic * points.normal[2], held])
         return self.pose_effects @ columns, sources + self.moved.T @ columns
+
+    @property
+    def moves(self) -> IntArray:
+        """Return which rows of :meth:`effects`, one below the other, are moves of the part.
+
+        Those of the pose, and of what was held its first order.
+        """
+        fitted, sources = self.moved.shape
+        first = fitted + sources - 2 * len(self.held_effects)
+        held = np.arange(first, fitted + sources, 2)
+        return np.asarray([*range(fitted), *held], np.int64)
 
     def good(self, points: Placed) -> BoolArray:
         """Return which points (n,) are no outliers."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import curvature_of, root_of
 from omsm_ros.core.surface.forbes import Series, bfs_series, freeform_series
@@ -69,7 +70,7 @@ class QFreeform:
 
     def _departure(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return δ [m] and its slopes [1]; u^m exp(imθ) is a power of (x + iy)/aperture_radius."""
-        w = np.asarray(x / self.aperture_radius + 1j * (y / self.aperture_radius))
+        w: ComplexArray = np.asarray(np.add(x, np.multiply(1j, y)) / self.aperture_radius)
         s = np.square(w.real) + np.square(w.imag)
         total = np.zeros((3, *w.shape))
         for m, (cosines, sines) in self._by_order().items():
@@ -79,7 +80,7 @@ class QFreeform:
                 radial = 2 * ((1 - 2 * s) * q + s * (1 - s) * rate)
                 total[1:] += radial * np.stack([w.real, w.imag])
                 continue
-            lower = w ** (m - 1)
+            lower: ComplexArray = w ** (m - 1)
             for values, phase in ((cosines, 1.0), (sines, -1j)):
                 if not any(values):
                     continue
@@ -100,7 +101,7 @@ class QFreeform:
 
 
 def _angular(
-    series: Series, lower: FloatArray, w: FloatArray, m: int
+    series: Series, lower: ComplexArray, w: ComplexArray, m: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Re(e wᵐ) q(|w|²) and its derivatives by the parts of w; ``lower`` is e w^(m−1)."""
     q, rate = series

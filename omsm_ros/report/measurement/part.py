@@ -16,6 +16,8 @@ _FIGURES = {
     "peak_to_valley": "of the part, less what noise and other errors add: peak to valley",
     "robust_peak_to_valley": "of the part: peak to valley of 99.5 %",
     "rms": "of the part: rms",
+    "peak_to_valley_best_fit": "what no move of the part explains (best fit): peak to valley",
+    "rms_best_fit": "best fit: rms",
 }
 _CONFORMITY = {
     "holds": ("good", "The part holds its tolerance"),

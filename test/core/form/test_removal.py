@@ -1,7 +1,7 @@
 import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap
-from omsm_ros.core.form.removal import without_second_order
+from omsm_ros.core.form.removal import best_fit, without_second_order
 
 
 def test_the_second_order_goes_and_nothing_else():
@@ -27,3 +27,20 @@ def test_a_profile_has_a_second_order_too():
     map_ = DeviationMap(x=x, y=0 * x, deviation=1e-9 + 3 * x**2, area=np.ones(500),
                         effects=np.empty((0, 500)), noise=0.0)  # fmt: skip
     np.testing.assert_allclose(without_second_order(map_).deviation, 0, atol=1e-15)
+
+
+def test_where_it_fits_best_a_part_has_no_move_and_keeps_all_else():
+    """Moves in any unit, one of them of no size; what an error does beside a move stays."""
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-1e-2, 1e-2, (2, 3000))
+    form = 1e-8 * np.cos(500 * x) * np.cos(400 * y)
+    moves = np.stack([1e-15 * x, 3e-9 + 0 * y, 0 * x])
+    map_ = DeviationMap(x=x, y=y, deviation=form + 5e-7 * x + 2e-7, area=np.ones(3000),
+                        effects=np.stack([moves[0], form, *moves[1:]]), noise=0.0,
+                        moves=np.array([0, 2, 3]))  # fmt: skip
+    found = best_fit(map_)
+    design = np.stack([x, np.ones_like(x)], axis=1)
+    rest = form - design @ np.linalg.lstsq(design, form, rcond=None)[0]
+    np.testing.assert_allclose(found.deviation, rest, atol=1e-18)
+    np.testing.assert_allclose(found.effects[1], rest, atol=1e-18)
+    np.testing.assert_allclose(found.effects[[0, 2, 3]], 0, atol=1e-20)
