@@ -18,7 +18,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import CLOUD, SYSTEMATIC
-from omsm_ros.storage.maps.length_units import LengthUnits
+from omsm_ros.storage.maps.length_units import LengthUnits, refuse_other
 from omsm_ros.storage.maps.read_map import read_points
 
 _PORTION = 131_072
@@ -78,6 +78,7 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
         points = read_points(file, units)
         gridded = as_grid(points) is not None
         return Measurement(lambda: _slices(points), (), False, points.notes, gridded)
+    refuse_other(units, LengthUnits(1.0, 1.0), f"cloud {str(file)!r}")
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
     if fields is None:

@@ -16,7 +16,12 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, whole_file
-from omsm_ros.storage.maps.length_units import LengthUnits, name_and_unit, needed
+from omsm_ros.storage.maps.length_units import (
+    LengthUnits,
+    name_and_unit,
+    needed,
+    refuse_other,
+)
 from omsm_ros.storage.table_file import rows_in
 
 # As many points as a map may have, in lines of sixty characters.
@@ -115,10 +120,19 @@ def _columns(
             continue
         if role in stated:
             scales[role] = stated[role]
+            _agreed(units, role, stated[role], what)
         else:
             given = needed(units, what)
             scales[role] = given.lateral if role in "xy" else given.height
     return places, scales
+
+
+def _agreed(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
+    """Refuse a column whose name states another unit than was given."""
+    if units is None:
+        return
+    own = (stated, units.height) if role in "xy" else (units.lateral, stated)
+    refuse_other(units, LengthUnits(*own), what)
 
 
 def _named(line: str, count: int) -> dict[str, tuple[int, float | None]]:

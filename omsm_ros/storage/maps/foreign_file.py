@@ -11,7 +11,7 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import FileError
 from omsm_ros.storage.files import open_regular, said
-from omsm_ros.storage.maps.length_units import LengthUnits, metres_in, needed
+from omsm_ros.storage.maps.length_units import LengthUnits, metres_in, needed, refuse_other
 from omsm_ros.storage.maps.optional import library
 
 MAX_FOREIGN_BYTES = 1_000_000_000
@@ -38,6 +38,8 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     if height.ndim != 2 or found.physical_sizes is None:
         raise FileError(f"{what} is no map with its size; convert it to xyz")
     metres = metres_in(str(found.unit)) if found.unit else None
+    if metres:
+        refuse_other(units, LengthUnits(metres, metres), what)
     scale = LengthUnits(metres, metres) if metres else needed(units, what)
     dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
     return HeightGrid(

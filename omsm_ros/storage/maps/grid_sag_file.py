@@ -17,6 +17,7 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, whole_file
+from omsm_ros.storage.maps.length_units import LengthUnits, refuse_other
 from omsm_ros.storage.table_file import rows_in
 
 _UNITS_M = (1e-3, 1e-2, 0.0254, 1.0)
@@ -40,10 +41,13 @@ def _first_line(text: str) -> tuple[float, ...] | None:
     return numbers if fits and np.all(np.isfinite(numbers)) else None
 
 
-def read_grid_sag(path: Path) -> HeightGrid:
+def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
     """Read a grid sag file; a point flagged "no data" is missing.
 
-    Raises FileError for a file of other lines, or of fewer or more points than it says.
+    units: what the reader takes the file for, if anything
+
+    Raises FileError for a file of other lines, of fewer or more points than it says, or of other
+    ``units``.
     """
     what = f"grid sag {str(path)!r}"
     with open_regular(path, FileError, "grid sag") as stream:
@@ -57,6 +61,8 @@ def read_grid_sag(path: Path) -> HeightGrid:
                 f"{what} does not begin with columns, rows (5 or more), two spacings, unit and "
                 "decentres"
             )
+        scale = _UNITS_M[int(first[4])]
+        refuse_other(units, LengthUnits(scale, scale), what)
         columns, rows = int(first[0]), int(first[1])
         MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
         table = rows_in(text, what, "write a line a point", comments=_COMMENT)

@@ -18,6 +18,8 @@ _METRES = {
     ("in", "inch", "inches"): 0.0254,
     ("Å", "å", "angstrom", "angstroms"): 1e-10,
 }
+# Of two ways to write one factor.
+_ALIKE = 1e-9
 METRES = {name: factor for names, factor in _METRES.items() for name in names}
 """Metres in one of each unit."""
 
@@ -60,6 +62,30 @@ def needed(units: LengthUnits | None, what: str) -> LengthUnits:
             "--unit mm,nm where the heights have another one"
         )
     return units
+
+
+def refuse_other(units: LengthUnits | None, stated: LengthUnits, what: str) -> None:
+    """Raise FileError, which calls the file ``what``, where it states other units than were given.
+
+    One of the two is wrong by a factor, and nobody but the reader can tell which.
+    """
+    if units is None:
+        return
+    for name, given, own in (
+        ("x and y", units.lateral, stated.lateral),
+        ("heights", units.height, stated.height),
+    ):
+        if abs(given - own) > _ALIKE * own:
+            raise FileError(
+                f"{what} says that its {name} are in {_called(own)}, and --unit says "
+                f"{_called(given)}; leave --unit out, or correct what the file says"
+            )
+
+
+def _called(metres: float) -> str:
+    """Return the shortest name of a unit of so many metres."""
+    names = [name for name, factor in METRES.items() if abs(factor - metres) <= _ALIKE * metres]
+    return names[0] if names else f"{metres:g} m"
 
 
 def name_and_unit(text: str) -> tuple[str, float | None]:

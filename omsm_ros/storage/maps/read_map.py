@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -56,19 +57,26 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         return read_ply(path, units)
     if head.startswith((b"# .PCD", b"VERSION")):
         return read_pcd(path, units)
+    if (found := _in_metres(path, head)) is not None:
+        # Their layout fixes what they count in: nothing can contradict it.
+        unasked = ("its format says in which units it is: --unit was not used",) if units else ()
+        return replace(found, notes=(*found.notes, *unasked))
+    if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
+        return read_foreign(path, units)
+    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(_first_data_line(head)):
+        return read_grid_sag(path, units).points()
+    return read_columns(path, units)
+
+
+def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
+    """Read a file of a format that fixes its units; None for any other."""
     if head.startswith(metropro_file.MAGIC):
         return metropro_file.read_metropro(path)
     if head.startswith(hdf5_file.MAGIC):
         return hdf5_file.read_hdf5(path)
     if path.suffix.lower() == ".x3p":
         return read_x3p(path)
-    if has_dabam_header(path):
-        return read_dabam(path)
-    if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
-        return read_foreign(path, units)
-    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(_first_data_line(head)):
-        return read_grid_sag(path).points()
-    return read_columns(path, units)
+    return read_dabam(path) if has_dabam_header(path) else None
 
 
 def _first_data_line(head: bytes) -> str:

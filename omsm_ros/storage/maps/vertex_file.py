@@ -15,7 +15,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.storage.files import open_regular, said, whole_file
-from omsm_ros.storage.maps.length_units import LengthUnits, needed
+from omsm_ros.storage.maps.length_units import LengthUnits, needed, refuse_other
 from omsm_ros.storage.table_file import rows_in
 
 IN_METRES = "lengths in metres"
@@ -153,7 +153,10 @@ def _points(
 ) -> MeasuredPoints:
     names = table.dtype.names or ()
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
-    scale = LengthUnits(1.0, 1.0) if ours else needed(units, what)
+    metres = LengthUnits(1.0, 1.0)
+    if ours:
+        refuse_other(units, metres, what)
+    scale = metres if ours else needed(units, what)
     height = "height" if "height" in names else "z"
     spread = _quiet(table["uncertainty"]) if ours and "uncertainty" in names else None
     return measured(

@@ -59,6 +59,14 @@ def test_a_fringe_is_half_a_wavelength(tmp_path, resolution, steps, intensity):
     assert (points.x[half], points.y[half]) == pytest.approx((0, PIXEL))
 
 
+def test_a_unit_that_no_format_asks_for_is_told_as_not_used(tmp_path):
+    path = tmp_path / "zygo.dat"
+    path.write_bytes(metropro(np.array([[4096, 0], [0, 0]])))
+    points = read_points(path, units_of("mm"))
+    assert "--unit was not used" in points.notes[-1]
+    assert points.height.max() == pytest.approx(WAVELENGTH / 16, rel=1e-6)
+
+
 def test_an_inverted_sign_is_told(tmp_path):
     path = tmp_path / "zygo.dat"
     path.write_bytes(metropro(np.array([[4096, 0], [0, 0]]), sign=1))

@@ -7,6 +7,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.storage.maps.grid_sag_file import read_grid_sag, write_grid_sag
 from omsm_ros.storage.maps.length_units import name_and_unit, units_of
 from omsm_ros.storage.maps.read_map import read_points
+from omsm_ros.storage.maps.vertex_file import write_ply
 
 from .surfaces import by_place, grid
 
@@ -50,6 +51,33 @@ def test_a_unit_that_is_not_there_is_asked_for(tmp_path, header):
     points = read_points(path, units_of("mm,nm"))
     assert points.x == pytest.approx(TABLE[:, 0] * MM)
     assert points.height == pytest.approx(TABLE[:, 2] * NM)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.xyz", "x_mm y_mm z_nm\n", "x and y are in mm, and --unit says um"),
+        ("a.xyz", "x_um y_um z_nm\n", "heights are in nm, and --unit says um"),
+        ("a.dat", "5 5 0.1 0.1 0 0 0\n", "x and y are in mm, and --unit says um"),
+        ("a.ply", None, "x and y are in m, and --unit says um"),
+    ],
+)
+def test_a_unit_that_the_text_contradicts_is_refused(tmp_path, name, text, told):
+    """One of the two is wrong by a thousand; the one in the text silently won before."""
+    path = tmp_path / name
+    if text is None:
+        write_ply(path, np.zeros(9, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
+    else:
+        path.write_text(text + "1 2 3\n" * 25)
+    with pytest.raises(FileError, match=f"{told}; leave --unit out"):
+        read_points(path, units_of("um"))
+
+
+def test_a_unit_that_the_text_says_too_is_taken(tmp_path):
+    path = _text(tmp_path, "x_mm y_mm z_nm\n1 2 3\n")
+    assert read_points(path, units_of("mm,nm")).height == pytest.approx(3 * NM)
+    half = _text(tmp_path, "x_mm y_mm z\n1 2 3\n")
+    assert read_points(half, units_of("mm,um")).height == pytest.approx(3e-6)
 
 
 def test_columns_are_found_by_name_in_any_order(tmp_path):
