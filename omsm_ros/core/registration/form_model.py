@@ -161,6 +161,16 @@ class Estimate(NamedTuple):
     sizes: FloatArray
     noise: float
 
+    @property
+    def length(self) -> float:
+        """Return how long the step is, in its own standard uncertainty."""
+        free = len(self.step)
+        spread = np.sqrt(np.diag(self.covariance)[:free])
+        shared = self.covariance[:free, :free] / np.outer(spread, spread)
+        inverse = np.linalg.pinv(shared, rcond=1e-14, hermitian=True)
+        step = self.step / spread
+        return float(np.sqrt(max(step @ inverse @ step, 0.0)))
+
 
 def estimate(
     gram: FloatArray, moments: FloatArray, variance: float, largest: float, group: IntArray

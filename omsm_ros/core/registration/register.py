@@ -55,6 +55,9 @@ _MOST_TURNS, _MOST_REFINED = 30, 30
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose stands when its last step moved no point by more than this share of their spread.
 _SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
+# Or by this share of what is unknown of it: where form and pose look alike, the sizes of form that
+# are found go to and fro by a thousandth, and the pose with them by twentieths of its uncertainty.
+_SHARE_OF_UNCERTAINTY = 0.1
 
 
 def register(
@@ -284,7 +287,8 @@ class _Fit:
             # Of all freedoms together: what x does a tilt may undo.
             gram = sums.gram[: len(step), : len(step)]
             square = float(found.step @ gram @ found.step) / sums.points
-            if turn > 3 and square < settled**2:
+            still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
+            if turn > 3 and still:
                 smooth = np.concatenate([found.step, found.form]) @ columns
                 limit = limit_of(points.deviation - smooth)
                 return _Stand(at, like, limit, found, sums)

@@ -1,0 +1,51 @@
+"""Beside form that nobody knows: how long a step is, and poses that go to and fro within it."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.registration.form_model import Estimate
+from omsm_ros.core.registration.freedoms import parsed_freedoms
+from omsm_ros.core.registration.placement import FREEDOMS, Aperture, Portion
+from omsm_ros.core.registration.register import register
+from omsm_ros.core.surface.freeforms import ZernikeSurface
+from omsm_ros.core.surface.nominal import Sphere
+from omsm_ros.core.surface.posed import Sum
+from omsm_ros.twin.part_pose import PartPose, posed
+
+RADIUS = 12.7e-3
+
+
+def test_a_step_is_measured_in_its_own_uncertainty():
+    """By the inverse of the covariance, whatever the units of the freedoms."""
+    rng = np.random.default_rng(1)
+    mixed = rng.normal(size=(3, 3)) * np.array([[1e-9], [1e3], [1.0]])
+    covariance = np.zeros((5, 5))
+    covariance[:3, :3] = mixed @ mixed.T
+    step = mixed @ np.array([2.0, -1.0, 2.0])
+    made = Estimate(step, np.zeros(2), covariance, np.zeros(2), 1.0)
+    assert made.length == pytest.approx(3.0, rel=1e-6)
+
+
+@pytest.mark.soak
+def test_a_pose_that_goes_to_and_fro_within_its_uncertainty_stands():
+    """A weak freeform: the sizes of form jump by a thousandth, and no whole step ever was small."""
+    nominal = Sum((Sphere(0.1), ZernikeSurface(RADIUS, (0, 0, 0, 0, 1e-5, 0, 4e-6, 0, 0, 3e-6))))
+    rng = np.random.default_rng([7, 7])
+    s = rng.uniform(-1, 1, 6)
+    a, b = rng.uniform(0, 2 * np.pi, 2)
+    bent = (50e-9 * np.cos(a), 50e-9 * np.sin(a), 15e-9 * np.cos(b), 15e-9 * np.sin(b))
+    part = Sum((nominal, ZernikeSurface(RADIUS, (0, 0, 0, 0, *bent))))
+    half = np.radians(0.5)
+    pose = {"x": 5e-4 * s[0], "y": 5e-4 * s[1], "piston": 5e-4 * s[2]}
+    pose |= {"tip": half * s[3], "tilt": half * s[4], "clocking": half * s[5]}
+    sits = PartPose(
+        x_m=pose["x"], y_m=pose["y"], z_m=pose["piston"],
+        tilt_x_rad=pose["tip"], tilt_y_rad=pose["tilt"], clocking_rad=pose["clocking"],
+    )  # fmt: skip
+    r, angle = np.linspace(RADIUS, 0, 20_000), np.linspace(0, 254 * np.pi, 20_000)
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    height = posed(part, sits).height(x, y) + rng.normal(0, 10e-9, len(x))
+    portion = Portion(x, y, height, np.empty((0, len(x))))
+    found = register(nominal, lambda: [portion], parsed_freedoms("auto"), aperture=Aperture(RADIUS))
+    for name in FREEDOMS[:6]:
+        assert abs(found.placement.value(name) - pose[name]) < 3 * found.uncertainty(name)
