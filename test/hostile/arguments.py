@@ -81,7 +81,7 @@ _GOOD = {
     "--reason": "datasheet",
     "--nominal": "surface.yaml",
     "--low-pass": "1e-3",
-    "--unit": "mm",
+    "--unit": "m",
     "--map": "map.yaml",
     "--catalogue": "catalogue.sqlite",
 }
