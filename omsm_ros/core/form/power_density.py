@@ -2,8 +2,10 @@
 
 ``S(f_x, f_y) = dx dy |FFT(w z)|² / Σ w²``, two-sided, in m⁴, with the window ``w`` of the cells
 that are there: its sum over all frequencies times df_x df_y is the mean square of the map under
-that window (Parseval). Over radial frequency it is the mean over direction, so that
-``∫ 2π f S(f) df`` is the same; over direction, the mean square per radian of half a turn.
+that window (Parseval). Over radial frequency it is the content of each ring of width Δf by that
+ring's area, so that ``Σ 2π f S(f) Δf`` is the mean square in the band of those rings, which ends
+where not all directions are there any more; over direction, the mean square per radian of half a
+turn, whose integral is the whole.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from omsm_ros.core.samples.blocks import FloatArray
 
 # Of half a turn, five degrees each: the other half is the same.
 _SECTORS = 36
+# A cell of frequency may lie in two rings: by its parts across and along.
+_PARTS = 3
 # Any, but one: the same points have the same figures.
 _NOISE_SEED = 22
 
@@ -40,6 +44,7 @@ class PowerDensity:
     """areal: S (r, c) [m⁴] over frequencies x (c,) and y (r,) [1/m];  mean_square: under w [m²]
 
     radial: S over radial frequency [1/m], [m⁴];  azimuthal: over direction from x [rad], [m²/rad]
+    band: of the radial one, from and to [1/m];  mean_square_in_band: under w [m²]
     """
 
     x: FloatArray
@@ -48,6 +53,22 @@ class PowerDensity:
     mean_square: float
     radial: Curve
     azimuthal: Curve
+    band: tuple[float, float]
+    mean_square_in_band: float
+
+    def coarse(self, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return x (c,), y (r,), S (r, c) of whole blocks, at most ``most`` of them each way.
+
+        In rising order of frequency; what is left over at the highest frequencies is left out.
+        """
+        across, along = (-(-len(values) // most) for values in (self.x, self.y))
+        columns, rows = (
+            np.argsort(v)[: len(v) // k * k] for v, k in ((self.x, across), (self.y, along))
+        )
+        areal = self.areal[np.ix_(rows, columns)]
+        blocks = areal.reshape(len(rows) // along, along, len(columns) // across, across)
+        x, y = self.x[columns].reshape(-1, across), self.y[rows].reshape(-1, along)
+        return x.mean(axis=1), y.mean(axis=1), np.asarray(blocks.mean(axis=(1, 3)))
 
 
 def power_density(cells: Cells) -> PowerDensity:
@@ -61,8 +82,11 @@ def power_density(cells: Cells) -> PowerDensity:
     noise = np.random.default_rng(_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
     of_noise, _ = _areal(cells, noise, window)
     y, x = (np.asarray(np.fft.fftfreq(size, cells.pitch), np.float64) for size in cells.mean.shape)
-    radial, azimuthal = _averaged(x, y, areal, of_noise)
-    return PowerDensity(x, y, areal, mean_square, radial, azimuthal)
+    radial, step = _over_frequency(x, y, areal, of_noise)
+    band = (step / 2, float(radial.position[-1]) + step / 2)
+    inside = float(np.sum(2 * np.pi * radial.position * radial.value) * step)
+    azimuthal = _over_direction(x, y, areal, of_noise)
+    return PowerDensity(x, y, areal, mean_square, radial, azimuthal, band, inside)
 
 
 def _window(cells: Cells) -> FloatArray:
@@ -82,38 +106,47 @@ def _areal(cells: Cells, image: FloatArray, window: FloatArray) -> tuple[FloatAr
     return np.asarray(density), float(np.sum(tapered**2) / square)
 
 
-def _averaged(
+def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the spacings of the frequencies along x and y [1/m]."""
+    across, along = (float(v[1] - v[0]) if len(v) > 1 else 1.0 for v in (x, y))
+    return across, along
+
+
+def _over_frequency(
     x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray
-) -> tuple[Curve, Curve]:
-    steps = (x[1] - x[0] if len(x) > 1 else 1.0), (y[1] - y[0] if len(y) > 1 else 1.0)
-    frequency = np.hypot(x[np.newaxis], y[:, np.newaxis]).ravel()
-    step = float(max(steps))
-    ring = np.rint(frequency / step).astype(np.int64)
+) -> tuple[Curve, float]:
+    """Return S over radial frequency, and the width of its rings [1/m]."""
+    steps = _steps(x, y)
+    cell, step = steps[0] * steps[1], max(steps)
     # Beyond the Nyquist frequency of an axis not all directions are there.
-    whole = (ring > 0) & (frequency <= min(np.abs(x).max(), np.abs(y).max()))
+    last = max(int(min(np.abs(x).max(), np.abs(y).max()) / step - 0.5), 1)
+    content, of_noise = np.zeros((2, last + 1))
+    parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
+    for across in parts * steps[0]:
+        for along in parts * steps[1]:
+            frequency = np.hypot((x + across)[np.newaxis], (y + along)[:, np.newaxis]).ravel()
+            # The cell about zero is empty, for the mean is no content.
+            ring = np.maximum(np.rint(frequency / step).astype(np.int64), 1)
+            inside = ring <= last
+            for total, values in ((content, areal), (of_noise, noise)):
+                total += np.bincount(ring[inside], values.ravel()[inside], last + 1)
+    position = np.asarray(step * np.arange(1, last + 1), np.float64)
+    area = 2 * np.pi * position * step
+    value, floor = (total[1:] * cell / _PARTS**2 / area for total in (content, of_noise))
+    # Of a real map each frequency stands twice.
+    independent = np.maximum(area / cell / 2, 1.0)
+    return Curve(position, value, np.hypot(value / np.sqrt(independent), floor)), step
+
+
+def _over_direction(x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray) -> Curve:
+    steps = _steps(x, y)
     angle = np.arctan2(y[:, np.newaxis] + 0 * x, x[np.newaxis] + 0 * y[:, np.newaxis]).ravel()
     sector = np.floor((angle % np.pi) / np.pi * _SECTORS).astype(np.int64) % _SECTORS
-    radial = _mean_by(ring[whole], frequency[whole], areal.ravel()[whole], noise.ravel()[whole])
-    per_angle = float(abs(steps[0] * steps[1])) * _SECTORS / np.pi
+    per_angle = abs(steps[0] * steps[1]) * _SECTORS / np.pi
     content, of_noise = (
         np.asarray(np.bincount(sector, v.ravel(), _SECTORS) * per_angle, np.float64)
         for v in (areal, noise)
     )
     scatter = np.sqrt(np.bincount(sector, areal.ravel() ** 2, _SECTORS)) * per_angle
     directions = np.asarray((np.arange(_SECTORS) + 0.5) * np.pi / _SECTORS, np.float64)
-    return radial, Curve(directions, content, np.asarray(np.hypot(scatter, of_noise)))
-
-
-def _mean_by(
-    group: FloatArray, position: FloatArray, value: FloatArray, noise: FloatArray
-) -> Curve:
-    counts = np.bincount(group)
-    filled = counts > 0
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(group, values)[filled] / counts[filled])
-
-    # Of a real map each frequency stands twice.
-    independent = np.maximum(counts[filled] / 2, 1.0)
-    spread = mean(value) / np.sqrt(independent)
-    return Curve(mean(position), mean(value), np.hypot(spread, mean(noise)))
+    return Curve(directions, content, np.asarray(np.hypot(scatter, of_noise)))

@@ -16,6 +16,8 @@ from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profil
 _HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
 # Around, the outer third of the radius is averaged over each of so many degrees.
 _OUTER, _DEGREES = 2 / 3, 2.0
+# Rings are as narrow as the turns of the scan allow, but for a tenth of the radius.
+_RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
 
 Averaging = Callable[[FloatArray], Profile]
 
@@ -32,10 +34,22 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, Curve]:
         name: lambda d, angle=angle: line_profile(x, y, d, angle=angle, **band)  # type: ignore[misc]
         for name, angle in (("x", 0.0), ("y", np.pi / 2), ("diagonal", np.pi / 4))
     }
-    made["radius"] = lambda d: radial_profile(x, y, d, spacing=2 * _SPACING * disc.radius)
+    width = _ring(x, y, disc.radius)
+    made["radius"] = lambda d: radial_profile(x, y, d, spacing=width)
     made["angle"] = lambda d: _around(x, y, d, disc.radius)
     found = {name: _curve(map_, average) for name, average in made.items()}
     return {name: curve for name, curve in found.items() if len(curve.position)}
+
+
+def _ring(x: FloatArray, y: FloatArray, radius: float) -> float:
+    """Return the least width of rings [m] most of which were seen all around."""
+    reach = np.hypot(x, y)
+    extent = float(reach.max() - reach.min())
+    for width in np.array(_RINGS) * radius:
+        found = radial_profile(x, y, reach, spacing=float(width))
+        if len(found.position) * width >= _COVERED * extent:
+            return float(width)
+    return float(_RINGS[-1] * radius)
 
 
 def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) -> Profile:

@@ -107,7 +107,11 @@ def test_the_density_holds_the_mean_square_and_where_it_is(angle):
     assert abs(turn.position[np.argmax(turn.value)] - angle) < 0.1
     radial = found.radial
     total = np.sum(2 * np.pi * radial.position * radial.value) * step_x
-    assert total == pytest.approx(found.mean_square, rel=0.05)
+    assert total == pytest.approx(found.mean_square_in_band, rel=1e-12)
+    assert total == pytest.approx(found.mean_square, rel=0.01)
+    low, high = found.band
+    assert (low, high) == pytest.approx((step_x / 2, radial.position[-1] + step_x / 2))
+    assert high <= 1 / (2 * cells.pitch) + step_x
     assert radial.position[np.argmax(radial.value)] == pytest.approx(800.0, rel=0.05)
 
 
@@ -119,8 +123,22 @@ def test_the_density_of_noise_is_flat_and_of_the_known_height():
     height = np.mean(cells.noise**2) * cells.pitch**2
     middle = found.value[5:-5]
     assert np.mean(middle) == pytest.approx(height, rel=0.05)
+    # Of the corners, where not all directions are, the radial one has nothing: π/4 is left.
+    both = power_density(cells)
+    assert both.mean_square_in_band == pytest.approx(np.pi / 4 * both.mean_square, rel=0.04)
     # All of it is noise, and the uncertainty says so.
     assert np.all(middle < 2.5 * found.uncertainty[5:-5])
+
+
+def test_blocks_of_the_density_hold_what_their_cells_do():
+    found = power_density(Cells.of(square(wave(1.25e-3, angle=0.4))))
+    x, y, areal = found.coarse(48)
+    assert areal.shape == (len(y), len(x))
+    assert max(areal.shape) <= 48
+    held = areal.sum() * (x[1] - x[0]) * (y[1] - y[0])
+    assert held == pytest.approx(found.mean_square, rel=1e-3)
+    row, column = np.unravel_index(np.argmax(areal), areal.shape)
+    assert np.hypot(x[column], y[row]) == pytest.approx(800.0, abs=(x[1] - x[0]) / 2**0.5)
 
 
 def test_a_strip_and_a_disc_have_cells_too():

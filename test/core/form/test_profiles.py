@@ -30,6 +30,18 @@ def disc_map(sizes, noise=0.0, effects=(), points=60_000):
     )  # fmt: skip
 
 
+def test_a_scan_of_few_turns_has_a_radial_profile_too():
+    """Forty turns: rings of a fiftieth of the radius are not seen all around, wider ones are."""
+    r, angle = np.linspace(1, 0.01, 40_000), np.linspace(0, 80 * np.pi, 40_000)
+    x, y = DISC.radius * r * np.cos(angle), DISC.radius * r * np.sin(angle)
+    map_ = DeviationMap(x=DISC.x + x, y=DISC.y + y, deviation=1e-8 * r**2, area=r,
+                        effects=np.empty((0, len(r))), noise=1e-10)  # fmt: skip
+    curve = profiles(map_, DISC)["radius"]
+    assert len(curve.position) > 20
+    expected = 1e-8 * (curve.position / DISC.radius) ** 2
+    assert np.max(np.abs(curve.value - expected)) < 1e-10
+
+
 def test_profiles_run_where_they_say():
     """Astigmatism is ρ² along x, −ρ² along y, nothing at 45°, and cos 2θ around."""
     found = profiles(disc_map({Term(2, 2): 1e-8}, noise=1e-10), DISC)
