@@ -16,6 +16,8 @@ from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
 from omsm_ros.storage.maps.vertex_file import write_ply
 
+# Of the areal density each way: a picture of it, in 70 kB.
+_MOST_BLOCKS = 64
 _NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
 
 
@@ -110,14 +112,19 @@ def _advice(form: Form) -> list[str]:
 
 def _curves(form: Form) -> dict[str, Any]:
     density = form.density
+    x, y, areal = density.coarse(_MOST_BLOCKS)
     return {
         "profiles": {name: curve.entry() for name, curve in form.profiles.items()},
         "psd": {
             "radial": density.radial.entry(),
             "azimuthal": density.azimuthal.entry(),
+            "areal": {"x": x.tolist(), "y": y.tolist(), "value": areal.tolist()},
             "mean_square": density.mean_square,
-            "normalisation": "two-sided areal density [m^4] over frequency [1/m]; the integral of "
-            "2 pi f times it, and of that over direction [m^2/rad], are mean_square [m^2]",
+            "band": list(density.band),
+            "mean_square_in_band": density.mean_square_in_band,
+            "normalisation": "two-sided areal density [m^4] over frequency [1/m], in blocks; its "
+            "sum times the area of a block, and the integral of that over direction [m^2/rad], are "
+            "mean_square [m^2]; the integral of 2 pi f times the radial one is that in the band",
         },
     }
 

@@ -14,6 +14,7 @@ from omsm_ros.core.form.figures import (
     noise_beside,
     root_mean_square,
 )
+from omsm_ros.core.form.open_place import with_open_place
 from omsm_ros.core.form.optical_terms import optical_terms
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.form.power_density import Curve, PowerDensity, power_density
@@ -98,6 +99,7 @@ def analyse_form(
     map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
+    zernike = with_open_place(zernike, map_, found)
     cells = Cells.of(map_)
     formless = Cells.of(without_form(map_, found.disc))
     bands = bands_of(cells, *filters)

@@ -33,6 +33,8 @@ class Registration:
     moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
         then by how much what is held does (p, s + 2h)
     spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
+    dragged: by freedom that no points determine: what it does to each of the fitted, in the first
+        and second order (2,), where it is off by as much as it may be
     limit: deviation from the smooth form beyond which a point is an outlier [m]
     disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
@@ -46,6 +48,7 @@ class Registration:
     held_effects: FloatArray
     moved: FloatArray
     spread: dict[str, float]
+    dragged: dict[str, dict[str, FloatArray]]
     limit: float
     disc: Aperture
     basis: FormBasis
@@ -68,6 +71,23 @@ class Registration:
         held = effects_of_held(self.surface, self.placement, points, names, self.held_effects)
         sources = np.concatenate([systematic * points.normal[2], held])
         return self.pose_effects @ columns, sources + self.moved.T @ columns
+
+    def glides(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return how far (r, 2, n) [m] places x, y (n,) [m] of the part may lie beside where found.
+
+        For each of r freedoms that no points determine, off by as much as it may be; the others
+        follow, and the points stay on the surface.
+        """
+        pose = self.placement.pose
+        places = np.stack([x, y, np.nan_to_num(self.surface.height(x, y))])
+        there = pose.rotation @ places + pose.origin[:, np.newaxis]
+        found = np.empty((len(self.dragged), 2, len(x)))
+        for row, (name, others) in enumerate(self.dragged.items()):
+            step = np.array([widest(name), *(others[n][0] for n in self.freedoms.fitted)])
+            moved = self.placement.moved((name, *self.freedoms.fitted), step).pose
+            back = moved.rotation.T @ (there - moved.origin[:, np.newaxis])
+            found[row] = (back - places)[:2]
+        return found
 
     @property
     def moves(self) -> IntArray:

@@ -327,6 +327,7 @@ def _over_all(
         held_effects=held,
         moved=moved,
         spread=open_.spread(fit.freedoms, by_source),
+        dragged=open_.unknown,
         limit=stand.limit,
         disc=fit.basis.disc,
         basis=fit.basis,
