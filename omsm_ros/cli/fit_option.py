@@ -10,8 +10,8 @@ from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.freedoms import parsed_freedoms
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.readable import count, expanded, figure, measured
-from omsm_ros.report.measurement.part import dragged, settled
+from omsm_ros.readable import count, measured
+from omsm_ros.report.measurement.part import dragged, figure_rows, settled
 
 
 def freedoms(text: str) -> tuple[str, ...]:
@@ -66,8 +66,6 @@ def declare_tolerance(sub: argparse.ArgumentParser) -> None:
     )
 
 
-_OTHER_UNITS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
-_SIGNED = ("Ssk",)
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 
@@ -80,15 +78,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
         (f"{n} not fitted", f"{why}{dragged(facts, n)}")
         for n, why in removed["not_determined"].items()
     ]
-    rows += [
-        (
-            figure(name),
-            expanded(
-                entry["value"], entry["uncertainty"], _OTHER_UNITS.get(name, "m"), name in _SIGNED
-            ),
-        )
-        for name, entry in facts["deviation"].items()
-    ]
+    rows += figure_rows(facts)
     others = ", ".join(
         f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
     )

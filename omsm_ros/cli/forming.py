@@ -9,23 +9,26 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, cell_of, number, refuse_cell
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.cli.exporting import UNIT
-from omsm_ros.cli.fit_option import declare_fit, form_rows
+from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.registration.freedoms import AUTO
 from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
-from omsm_ros.jobs.judge_form import judge_form
+from omsm_ros.jobs.judge_form import draw_form, judge_form
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
 from omsm_ros.jobs.show_surface import Scan, show_surface
 from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
 from omsm_ros.storage.machine_files import load_limits
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import DEGREE_RAD
 
 # ---------------------------------------------------------------------------------- form
+
+
+_WRITTEN = (CLOUD, SYSTEMATIC, SUMMARY, DEVIATION, CURVES, FORM, REPORT)
 
 
 def _declare_form(sub: argparse.ArgumentParser) -> None:
@@ -35,6 +38,8 @@ def _declare_form(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--calibration", type=Path, metavar="CAL.json", help="of a scan")
     sub.add_argument("--unit", **UNIT)
     declare_fit(sub, (AUTO,))
+    declare_tolerance(sub)
+    sub.add_argument("--no-report", action="store_true", help="no page")
     for name, what in (("s", "shorter"), ("l", "longer")):
         sub.add_argument(
             f"--{name}-filter",
@@ -46,7 +51,7 @@ def _declare_form(sub: argparse.ArgumentParser) -> None:
 
 def _form(args: argparse.Namespace) -> Facts:
     surface, filters = load_surface(args.nominal), (args.s_filter, args.l_filter)
-    with result_folder(args.out, (CLOUD, SYSTEMATIC, SUMMARY, DEVIATION, CURVES, FORM)) as out:
+    with result_folder(args.out, _WRITTEN) as out:
         source = args.measured
         if args.calibration:
             calibration = load_calibration(args.calibration)
@@ -57,11 +62,19 @@ def _form(args: argparse.Namespace) -> Facts:
         else:
             refuse_cell(source, args)
         points = open_measurement(source, args.unit)
-        return judge_form(points, surface, out, args.fit, args.aperture, filters)
+        facts = judge_form(points, surface, out, args.fit, args.aperture, filters, args.tolerance)
+        if not args.no_report:
+            draw_form(source, out)
+            facts = {**facts, "report": REPORT}
+        return facts
 
 
 def _show_form(facts: Facts) -> None:
-    table([*form_rows(facts), ("written", ", ".join((FORM, CURVES, DEVIATION)))])
+    verdict = []
+    if held := facts.get("conformity"):
+        verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
+    written = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
+    table([*verdict, *form_rows(facts), ("written", ", ".join(written))])
 
 
 # ---------------------------------------------------------------------------- compensate

@@ -9,12 +9,21 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.form.analyse import Form
+from omsm_ros.core.form.conformity import conformity
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.freedoms import MOVES
 from omsm_ros.core.registration.placement import FREEDOMS, Aperture
 from omsm_ros.jobs.measured_portions import Measurement
-from omsm_ros.storage.files import CURVES, DEVIATION, FORM, save_json
+from omsm_ros.storage.files import (
+    CLOUD,
+    CURVES,
+    DEVIATION,
+    FORM,
+    SUMMARY,
+    save_json,
+)
 from omsm_ros.storage.maps.vertex_file import write_ply
+from omsm_ros.storage.result_folder import read_result
 
 # Of the areal density each way: a picture of it, in 70 kB.
 _MOST_BLOCKS = 64
@@ -28,6 +37,7 @@ def judge_form(
     asked: Sequence[str],
     aperture: Aperture | None = None,
     filters: tuple[float | None, float | None] = (None, None),
+    tolerance: float | None = None,
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return what ``form.json`` says of it.
 
@@ -36,15 +46,33 @@ def judge_form(
 
     asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
     filters: wavelengths of the S- and the L-filter [m], None for what the points allow
+    tolerance: of the peak to valley of 99.5 % [m], if there is one
 
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
     form = measured.form(surface, asked, aperture, filters)
     facts = form_facts(form, measured)
+    if tolerance is not None:
+        found = conformity(form.deviation["robust_peak_to_valley"], tolerance)
+        facts["conformity"] = found.entry() if found else None
     save_json(out / FORM, facts)
     save_json(out / CURVES, _curves(form))
     write_ply(out / DEVIATION, _deviations(form))
     return facts
+
+
+def draw_form(measured: Path, out: Path) -> None:
+    """Write the page of a form that :func:`judge_form` has left in ``out``.
+
+    measured: what it is of; what a summary beside it says of the measurement is on the page
+    """
+    # Here, because drawing takes longer to load than many a form to judge.
+    from omsm_ros.jobs.publish import publish_form
+
+    folder = measured if measured.is_dir() else measured.parent
+    beside = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
+    summary = read_result(beside, "summary") if beside and beside.is_file() else None
+    publish_form(out, f"Form of {measured.resolve().name}", summary)
 
 
 def _deviations(form: Form) -> np.ndarray[Any, np.dtype[np.void]]:

@@ -20,8 +20,6 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of
-from omsm_ros.core.form.conformity import conformity
-from omsm_ros.core.form.figures import Figure
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import DataError
@@ -121,13 +119,18 @@ def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Reg
     from omsm_ros.jobs.judge_form import judge_form
     from omsm_ros.jobs.measured_portions import open_measurement
 
-    facts = judge_form(open_measurement(out), nominal, out, register.freedoms, register.aperture)
+    facts = judge_form(
+        open_measurement(out),
+        nominal,
+        out,
+        register.freedoms,
+        register.aperture,
+        tolerance=register.tolerance,
+    )
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
     if register.tolerance is not None:
-        figure = Figure(**facts["deviation"]["robust_peak_to_valley"])
-        found = conformity(figure, register.tolerance)
-        summary["form"]["conformity"] = found.entry() if found else None
+        summary["form"]["conformity"] = facts["conformity"]
 
 
 def summarise(

@@ -1,4 +1,4 @@
-"""The page of a finished measurement."""
+"""The page of a finished measurement, or of a part that was registered."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import bode
 from omsm_ros.report.maps.surface_map import EmbeddedMap, Layer, embedded
 from omsm_ros.report.measurement.cloud_view import CloudView
-from omsm_ros.report.measurement.figures import zernike_terms
+from omsm_ros.report.measurement.form_figures import form_figures
 from omsm_ros.report.measurement.gallery import levelled, surface_figures
 from omsm_ros.report.measurement.page import Report, render
-from omsm_ros.storage.files import DEVIATION, FORM, REPORT, save_text
+from omsm_ros.storage.files import CURVES, DEVIATION, FORM, REPORT, save_text
 from omsm_ros.storage.maps.read_map import read_points
 from omsm_ros.storage.result_folder import read_result
 
@@ -79,7 +79,7 @@ def publish(
     out: Path,
     title: str,
     summary: Mapping[str, Any],
-    calibration: Calibration,
+    calibration: Calibration | None,
     figures: Mapping[str, bytes],
     surface: EmbeddedMap | None = None,
 ) -> None:
@@ -87,16 +87,26 @@ def publish(
 
     surface: map that a reader can enlarge
     """
-    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    form = _form_in(out)
+    form, curves = _json_in(out, FORM), _json_in(out, CURVES)
     if form:
-        figures = {**figures, "zernike_terms": style.png(zernike_terms(form["zernike"]))}
-    page = render(Report(title, date, summary, calibration, figures, form, surface))
+        figures = {**figures, **form_figures(form, curves)}
+    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
     save_text(out / REPORT, page)
 
 
-def _form_in(out: Path) -> dict[str, Any]:
-    """Return the content of ``form.json`` in ``out``; empty where the part was not registered."""
-    if not (out / FORM).is_file():
+def publish_form(out: Path, title: str, summary: Mapping[str, Any] | None = None) -> None:
+    """Write ``report.html`` of a registered part, from what was written of it into ``out``.
+
+    summary: of the measurement that its points are of, if there is one
+    """
+    part = read_points(out / DEVIATION)
+    layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
+    publish(out, title, summary or {}, None, {}, embedded([layer]))
+
+
+def _json_in(out: Path, name: str) -> dict[str, Any]:
+    """Return the content of a file in ``out``; empty where the part was not registered."""
+    if not (out / name).is_file():
         return {}
-    return read_result(out / FORM, "form")
+    return read_result(out / name, name.removesuffix(".json"))

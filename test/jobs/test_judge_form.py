@@ -58,6 +58,7 @@ def folder(tmp_path_factory):
 
 def form(folder, out, *arguments):
     words = ["form", folder, "--nominal", folder / "mirror.yaml", "--out", out, *arguments]
+    words += [] if "--tolerance" in arguments else ["--no-report"]
     status = main([str(word) for word in words])
     return status, out / "form.json"
 
@@ -132,6 +133,27 @@ def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp
     assert abs(extent["value"] - np.ptp(rest)) < 3 * extent["uncertainty"]
     assert rms["uncertainty"] < 0.5e-9
     assert extent["uncertainty"] < 5e-9 < figures["peak_to_valley"]["uncertainty"]
+
+
+def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
+    words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS, "--tolerance", 1e-6)
+    status, path = form(folder, tmp_path, *words)
+    assert status == 0
+    assert json.loads(path.read_text())["conformity"]["verdict"] == "holds"
+    assert "holds" in capsys.readouterr().out
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 7
+    for text in ("Is the part good?", "By what was evaluated", "By the points alone", "Sku"):
+        assert text in page
+    curves = json.loads((tmp_path / "curves.json").read_text())
+    psd = curves["psd"]
+    x, y, areal = (np.array(psd["areal"][name]) for name in ("x", "y", "value"))
+    held = areal.sum() * (x[1] - x[0]) * (y[1] - y[0])
+    assert held == pytest.approx(psd["mean_square"], rel=0.02)
+    f, s = (np.array(psd["radial"][name]) for name in ("position", "value"))
+    inside = np.sum(2 * np.pi * f * s) * (f[1] - f[0])
+    assert inside == pytest.approx(psd["mean_square_in_band"], rel=1e-9)
+    assert set(curves["profiles"]) == {"x", "y", "diagonal", "radius", "angle"}
 
 
 def test_people_read_the_figures_too(folder, tmp_path, capsys):
@@ -231,7 +253,7 @@ def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
     text = np.stack([cloud["x"] * 1e3, cloud["y"] * 1e3, cloud["height"] * 1e9], axis=1)
     np.savetxt(tmp_path / "map.xyz", text, fmt="%.9g")
     words = ["form", tmp_path / "map.xyz", "--nominal", folder / "mirror.yaml", "--unit", "mm,nm"]
-    words += ["--out", tmp_path / "out", "--fit", "piston,tip,tilt"]
+    words += ["--out", tmp_path / "out", "--fit", "piston,tip,tilt", "--no-report"]
     assert main([str(word) for word in words]) == 0
     found = json.loads((tmp_path / "out" / "form.json").read_text())
     assert found["points"]["read"] == len(cloud)

@@ -6,7 +6,6 @@ SI, all labels carry the unit they are drawn in.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -210,23 +209,6 @@ def error_histogram(
     ax.set_xlim(edges[0], edges[-1])
     style.label(ax, x="size of the error", y="share of the area [%]", title="Size of the error")
     style.legend_above(ax)
-    return made
-
-
-def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw ``terms``, each {n, m, value, uncertainty (k = 1)} [m], without piston and tilts."""
-    shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
-    made, axes = style.figure(6.1, 3.7)
-    ax = axes[0, 0]
-    values = np.array([t["value"] for t in shown]) / NANOMETRE_M
-    spread = 2 * np.array([t["uncertainty"] or 0.0 for t in shown]) / NANOMETRE_M
-    colours = np.where(np.abs(values) > spread, style.AFTER, style.FAINT)
-    place = np.arange(len(shown))
-    ax.bar(place, values, color=list(colours), width=0.75)
-    ax.errorbar(place, values, spread, fmt="none", ecolor=style.INK, elinewidth=0.8, capsize=1.5)
-    ax.axhline(0.0, color=style.MUTED, linewidth=0.6)
-    ax.set_xticks(place, [f"{t['n']},{t['m']}" for t in shown], rotation=90)
-    style.label(ax, x="n, m", y="coefficient [nm]", title="Zernike terms of the deviation")
     return made
 
 

@@ -12,13 +12,15 @@ from omsm_ros.report.common import tables
 from omsm_ros.report.common.page_parts import Headline
 from omsm_ros.report.common.tables import part
 from omsm_ros.report.common.template import check_places, fill, picture
-from omsm_ros.report.common.verdict import verdict_on_measurement
+from omsm_ros.report.common.verdict import Verdict, verdict_on_measurement
 from omsm_ros.report.maps.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.measurement.part import (
+    form_table,
     limits_table,
     provenance_table,
     removed_table,
     verdict_on_part,
+    verdict_on_points,
 )
 
 
@@ -57,9 +59,25 @@ DYNAMICS = {
     "step_response": Caption("One edge of the step test, and the residual of the model."),
 }
 FORM = {
+    "form_lines": Caption(
+        "Deviation along the normal after the pose was taken out, mean over a band of 1/50 of the "
+        "radius. Shaded: expanded uncertainty (k = 2), with that of the pose."
+    ),
+    "form_rings": Caption("The mean of each ring, and of the outer third around. Shaded: k = 2."),
     "zernike_terms": Caption(
         "Terms of the deviation, each one at the rim, with their expanded uncertainty (k = 2). "
         "Grey: no larger than it."
+    ),
+    "psd_radial": Caption(
+        "Two-sided, of the points under a tapered window; the sum of 2πf S Δf is their mean square "
+        "in this band. Noise is in it, and in the shaded uncertainty (k = 2)."
+    ),
+    "psd_direction": Caption(
+        "Of waves that run this way, all frequencies; the integral over half a turn is the mean "
+        "square. Shaded: k = 2."
+    ),
+    "psd_areal": Caption(
+        "The same over both frequencies; its sum times the area of a block is the mean square."
     ),
 }
 CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
@@ -76,7 +94,7 @@ class Report:
         ``warnings``, ``settings``, ``versions``; lengths in metres
     calibration: that was applied, if any
     figures: PNG files by the names in :data:`CAPTIONS`
-    form: the content of ``form.json``, if the part was registered
+    form: the content of ``form.json``, if the part was registered;  curves: of ``curves.json``
     map: that a reader can enlarge
 
     Raises ConfigurationError for a figure of another name.
@@ -88,6 +106,7 @@ class Report:
     calibration: Calibration | None = None
     figures: Mapping[str, bytes] = field(default_factory=dict)
     form: Mapping[str, Any] = field(default_factory=dict)
+    curves: Mapping[str, Any] = field(default_factory=dict)
     map: EmbeddedMap | None = None
 
     def __post_init__(self) -> None:
@@ -101,7 +120,7 @@ def render(report: Report) -> str:
         "report.html",
         report=report,
         on_part=verdict_on_part(report.summary, report.form),
-        verdict=verdict_on_measurement(report.summary, report.calibration),
+        verdict=_trust(report),
         removed=removed_table(report.summary, report.form),
         script=drawing,
         script_policy=policy_of(drawing),
@@ -111,6 +130,12 @@ def render(report: Report) -> str:
         picture=lambda name: picture(report.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
+
+
+def _trust(report: Report) -> Verdict:
+    if report.form and not report.summary:
+        return verdict_on_points(report.form)
+    return verdict_on_measurement(report.summary, report.calibration)
 
 
 def headlines(summary: Mapping[str, Any]) -> list[Headline]:
@@ -151,7 +176,7 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
     groups = {
         "Surface": MAPS,
         "Profiles": PROFILES,
-        "Form": FORM,
+        "Form of the registered part": FORM,
         "Dynamic error": ERRORS,
         "Dynamics of the probe": DYNAMICS,
     }
@@ -161,8 +186,9 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
 
 def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
-    verdict = verdict_on_measurement(summary, report.calibration)
+    verdict = _trust(report)
     found = [
+        form_table(report.form, report.curves),
         tables.error_table(summary),
         tables.budget_table(summary),
         tables.Table("What stands against trust", (), [(reason,) for reason in verdict.reasons]),

@@ -6,19 +6,19 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from omsm_ros.readable import NOTHING, expanded, plain, quantity
+from omsm_ros.readable import NOTHING, expanded, figure, measured, plain, quantity
 from omsm_ros.report.common.tables import Table, part
 from omsm_ros.report.common.verdict import Verdict
+from omsm_ros.units import MILLIMETRE_M
 
 _FIGURES = {
-    "peak_to_valley_of_points": "of the points, with their noise: peak to valley",
-    "rms_of_points": "of the points, with their noise: rms",
-    "peak_to_valley": "of the part, less what noise and other errors add: peak to valley",
-    "robust_peak_to_valley": "of the part: peak to valley of 99.5 %",
-    "rms": "of the part: rms",
-    "peak_to_valley_best_fit": "what no move of the part explains (best fit): peak to valley",
-    "rms_best_fit": "best fit: rms",
+    "robust_peak_to_valley": "peak to valley of 99.5 % of the part",
+    "peak_to_valley": "peak to valley of all of it, less what noise and other errors add",
+    "rms": "rms",
+    "peak_to_valley_best_fit": "peak to valley of what no move of the part explains (best fit)",
 }
+_OTHER_UNITS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
+_SIGNED = ("Ssk",)
 _CONFORMITY = {
     "holds": ("good", "The part holds its tolerance"),
     "fails": ("bad", "The part fails its tolerance"),
@@ -35,7 +35,7 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
     deviation = part(form, "deviation")
     if deviation:
         words = [
-            f"{name} {_expanded(deviation[key])}"
+            f"{name}: {_expanded(deviation[key])}"
             for key, name in _FIGURES.items()
             if part(deviation, key, "value") is not None
         ]
@@ -48,7 +48,7 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
         ]
     else:
         return None
-    held = part(summary, "form", "conformity")
+    held = part(form, "conformity") or part(summary, "form", "conformity")
     if not held:
         words.append("no tolerance was given (--tolerance), so it is for you to say")
         return Verdict("unknown", "Deviation from nominal", tuple(words))
@@ -67,6 +67,42 @@ def _expanded(figure: Mapping[str, Any]) -> str:
     return text + larger if text.startswith("at most") else text
 
 
+def verdict_on_points(form: Mapping[str, Any]) -> Verdict:
+    """Say how far a form is to be trusted of whose points nothing but themselves is known."""
+    missing = tuple(part(form, "removed", "not_evaluated") or ())
+    if missing:
+        return Verdict(
+            "unknown", "By the points alone", (*(f"not evaluated: {m}" for m in missing),)
+        )
+    return Verdict("care", "By the points and their systematic fields", ("no summary lay beside",))
+
+
+def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return every figure of the deviation by its name, with its expanded uncertainty."""
+    return [
+        (
+            figure(name),
+            expanded(
+                entry["value"], entry["uncertainty"], _OTHER_UNITS.get(name, "m"), name in _SIGNED
+            ),
+        )
+        for name, entry in (part(form, "deviation") or {}).items()
+    ]
+
+
+def form_table(form: Mapping[str, Any], curves: Mapping[str, Any]) -> Table:
+    """Return all figures of the part's form, and what its spectral densities hold."""
+    rows = figure_rows(form)
+    band, inside = (part(curves, "psd", name) for name in ("band", "mean_square_in_band"))
+    if band:
+        ends = " to ".join(plain(frequency * MILLIMETRE_M) for frequency in band)
+        rows.append((f"rms of points in the band of the density, {ends} 1/mm",
+                     quantity(math.sqrt(inside), "m")))  # fmt: skip
+        whole = math.sqrt(part(curves, "psd", "mean_square"))
+        rows.append(("rms of points under its window", quantity(whole, "m")))
+    return Table("Figures of the form", (), [row for row in rows if row[1] != NOTHING])
+
+
 def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
     """Return what is no longer in the deviation: pose, and what the surface does not determine."""
     title, columns = "Taken out", ("value", "standard uncertainty")
@@ -78,7 +114,8 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
     rows = []
     for name in part(form, "removed", "fitted") or ():
         pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
-        rows.append((name, _size(pose.get("value"), unit), _size(settled(form, name), unit)))
+        spread = settled(form, name)
+        rows.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
     for name, why in held.items():
         spread = part(form, "pose", name, "uncertainty")
@@ -112,6 +149,13 @@ def dragged(form: Mapping[str, Any], name: str) -> str:
         f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v
     )
     return f"; {own} would go with {', '.join(others)}, at the same form"
+
+
+def _rounded(value: Any, spread: float | None, unit: str) -> str:
+    """Return a value to the place of its uncertainty, without that."""
+    if not spread or unit == "1/m":
+        return _size(value, unit)
+    return measured(value, spread, unit).partition(" ±")[0]
 
 
 def _size(value: Any, unit: str) -> str:

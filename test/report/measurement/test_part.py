@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 
 from omsm_ros.report.measurement.part import (
+    form_table,
     limits_table,
     provenance_table,
     removed_table,
     verdict_on_part,
+    verdict_on_points,
 )
 
 FORM = {
@@ -68,8 +70,30 @@ def test_without_a_tolerance_nothing_is_called_good():
 
 def test_every_figure_comes_with_its_expanded_uncertainty():
     reasons = [r.replace("\u202f", " ") for r in verdict_on_part(summary(), FORM).reasons]
-    assert reasons[0] == "of the points, with their noise: peak to valley 185 nm"
-    assert any(r.endswith("peak to valley 171 nm ± 60 nm (k = 2)") for r in reasons)
+    assert reasons[0] == "peak to valley of 99.5 % of the part: 124 nm ± 40 nm (k = 2)"
+    assert any(r.endswith("other errors add: 171 nm ± 60 nm (k = 2)") for r in reasons)
+
+
+def test_a_form_of_points_alone_says_what_nobody_looked_at():
+    found = verdict_on_points({"removed": {"not_evaluated": ["systematic errors"]}})
+    assert found.level == "unknown"
+    assert found.reasons == ("not evaluated: systematic errors",)
+    assert verdict_on_points({"removed": {"not_evaluated": []}}).level == "care"
+
+
+def test_all_figures_and_the_band_of_the_density_stand_in_one_table():
+    psd = {"band": [50.0, 6000.0], "mean_square_in_band": 4e-18, "mean_square": 9e-18}
+    rows = dict(form_table(FORM, {"psd": psd}).rows)
+    assert rows["PV of points"].replace("\u202f", " ") == "185 nm"
+    assert rows["PV of 99.5 %"] == "124 nm ± 40 nm (k = 2)"
+    assert rows["rms of points in the band of the density, 0.0500 to 6.00 1/mm"] == "2.00 nm"
+    assert rows["rms of points under its window"] == "3.00 nm"
+    assert form_table({}, {}).rows == []
+
+
+def test_what_was_taken_out_has_no_more_digits_than_are_known():
+    rows = {row[0]: row[1:] for row in removed_table(summary(), FORM).rows}
+    assert rows["tip"] == ("50.0 µrad", "2.00 µrad")
 
 
 def test_a_figure_below_its_uncertainty_is_a_bound():

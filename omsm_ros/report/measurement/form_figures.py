@@ -1,0 +1,166 @@
+"""Figures of a registered part, from what ``form.json`` and ``curves.json`` say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.report.common import style
+from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
+
+# Densities as opticians read them: nm² mm² over waves per millimetre.
+_AREAL_UNIT = NANOMETRE_M**2 * MILLIMETRE_M**2
+# What lies further below the highest is noise of the computation.
+_LEAST_SHARE = 1e-9
+# A band of uncertainty that reaches zero ends so far below the least value of a logarithmic axis.
+_BELOW = 0.2
+_WIDE, _HIGH = 6.1, 3.7
+_BELOW_BARS = 0.2
+_AREAL_PLACE, _BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
+_LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
+
+
+def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return PNG files by the names that the page knows; what was not computed has none."""
+    made = {"zernike_terms": zernike_terms(form["zernike"])}
+    profiles: Mapping[str, Any] = curves.get("profiles") or {}
+    if lines := {name: profiles[name] for name in _LINES if name in profiles}:
+        made["form_lines"] = line_profiles(lines)
+    if rings := {name: profiles[name] for name in ("radius", "angle") if name in profiles}:
+        made["form_rings"] = ring_profiles(rings)
+    if density := curves.get("psd"):
+        made["psd_radial"] = radial_density(density["radial"])
+        made["psd_direction"] = direction_density(density["azimuthal"])
+        if "areal" in density:
+            made["psd_areal"] = areal_density(density["areal"])
+    return {name: style.png(figure) for name, figure in made.items()}
+
+
+def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw ``terms``, each {n, m, value, uncertainty (k = 1)} [m], without piston and tilts."""
+    shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
+    made, axes = style.figure(_WIDE, _HIGH)
+    ax = axes[0, 0]
+    # Numbers on their side take more room than those of other axes.
+    box = ax.get_position()
+    ax.set_position((box.x0, _BELOW_BARS, box.width, box.y1 - _BELOW_BARS))
+    values = np.array([t["value"] for t in shown]) / NANOMETRE_M
+    spread = 2 * np.array([t["uncertainty"] or 0.0 for t in shown]) / NANOMETRE_M
+    colours = np.where(np.abs(values) > spread, style.AFTER, style.FAINT)
+    place = np.arange(len(shown))
+    ax.bar(place, values, color=list(colours), width=0.75)
+    ax.errorbar(place, values, spread, fmt="none", ecolor=style.INK, elinewidth=0.8, capsize=1.5)
+    ax.axhline(0.0, color=style.MUTED, linewidth=0.6)
+    ax.set_xticks(place, [f"{t['n']},{t['m']}" for t in shown], rotation=90)
+    title = "Zernike terms of the deviation"
+    style.label(ax, x="n,m", y="coefficient [nm]", title=title)
+    return made
+
+
+def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Draw deviations [nm] over the place [mm] on each line, with ±2u; one panel a line."""
+    made, axes = style.figure(_WIDE, 1.9 * len(lines) + 0.4, rows=len(lines), sharex=True)
+    for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
+        _draw(ax, curve, MILLIMETRE_M, NANOMETRE_M)
+        style.label(ax, y="[nm]", title=f"Registered deviation {_LINES[name]}")
+    axes[-1, 0].set_xlabel("place on the line [mm]", fontsize=style.TEXT_PT, color=style.INK)
+    return made
+
+
+def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Draw deviations [nm] over the radius [mm], the mean of a ring, and around [°], with ±2u."""
+    made, axes = style.figure(_WIDE, 2.7 * len(rings) + 0.4, rows=len(rings))
+    kinds = {
+        "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
+        "angle": (DEGREE_RAD, "angle from x [°]", "Around, outer third of the radius"),
+    }
+    for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):
+        unit, x, title = kinds[name]
+        _draw(ax, curve, unit, NANOMETRE_M)
+        style.label(ax, x=x, y="[nm]", title=title)
+    return made
+
+
+def radial_density(curve: Mapping[str, Any]) -> Figure:
+    """Draw the density [nm² mm²] over radial frequency [1/mm], logarithmic, with ±2u."""
+    made, axes = style.figure(_WIDE, _HIGH)
+    ax = axes[0, 0]
+    values = np.array(curve["value"], np.float64)
+    floor = max(_BELOW * float(values.min()), _LEAST_SHARE * float(values.max()))
+    _draw(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
+    ax.set_xscale("log")
+    ax.set_yscale("log", nonpositive="clip")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    style.label(
+        ax,
+        x="spatial frequency [1/mm]",
+        y="density [nm² mm²]",
+        title="Power spectral density over frequency",
+    )
+    return made
+
+
+def direction_density(curve: Mapping[str, Any]) -> Figure:
+    """Draw the mean square [nm²] per radian over the direction of waves [°], with ±2u."""
+    made, axes = style.figure(_WIDE, _HIGH)
+    ax = axes[0, 0]
+    _draw(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
+    ax.set_xlim(0, 180)
+    ax.set_xticks(range(0, 181, 30))
+    title = "Power spectral density over direction"
+    style.label(ax, x="direction from x [°]", y="mean square [nm²/rad]", title=title)
+    return made
+
+
+def areal_density(areal: Mapping[str, Any]) -> Figure:
+    """Draw the areal density [nm² mm²] over both frequencies [1/mm], logarithmic colours."""
+    x, y = (np.array(areal[name], np.float64) * MILLIMETRE_M for name in ("x", "y"))
+    value = np.array(areal["value"], np.float64) / _AREAL_UNIT
+    high = float(value.max()) or 1.0
+    # Nine tenths of the blocks in different colours.
+    low = max(float(np.quantile(value, 0.1)), high * _LEAST_SHARE)
+    made, axes = style.figure(_WIDE, _HIGH)
+    ax = axes[0, 0]
+    ax.grid(False)
+    shown = ax.pcolormesh(
+        x, y, np.maximum(value, low), norm=LogNorm(low, max(high, 2 * low)), cmap=style.MAP_COLOURS
+    )
+    ax.set_aspect("equal")
+    ax.set_position(_AREAL_PLACE)
+    bar = made.colorbar(shown, cax=made.add_axes(_BAR_PLACE))
+    bar.ax.tick_params(labelsize=style.TEXT_PT)
+    style.label(ax, x="f_x [1/mm]", y="f_y [1/mm]", title="Areal density [nm² mm²]")
+    return made
+
+
+def _draw(
+    axes: Axes,
+    curve: Mapping[str, Any],
+    along: float,
+    unit: float,
+    *,
+    floor: float | None = None,
+) -> None:
+    """Draw a curve in units of ``along`` and ``unit`` with a band of ±2u.
+
+    floor: below which the band does not go; None: it may be negative
+    """
+    position, value, spread = (
+        np.array(curve[name], np.float64) for name in ("position", "value", "uncertainty")
+    )
+    low, high = (value - 2 * spread) / unit, (value + 2 * spread) / unit
+    if floor is not None:
+        low = np.maximum(low, floor / unit)
+    place: FloatArray = position / along
+    axes.fill_between(place, low, high, color=style.AFTER, alpha=0.25, linewidth=0)
+    axes.plot(place, value / unit, color=style.AFTER, linewidth=1.0)
+    axes.margins(x=0.01)
