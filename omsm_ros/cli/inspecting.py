@@ -8,6 +8,7 @@ from pathlib import Path
 from omsm_ros.cli.arguments import add_bags, cell_of
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
+from omsm_ros.readable import quantity
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
@@ -51,7 +52,23 @@ def _show(facts: Facts) -> None:
     for topic in facts["topics"]:
         period = topic["sample_period"]
         print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+    table(_vibration(facts["vibration"]))
     table([("fault", text) for text in facts["faults"]] or [("faults", "none found")])
+
+
+def _vibration(found: Facts | None) -> list[tuple[str, str]]:
+    """Largest levels by band, as the vibration monitor told them."""
+    if found is None:
+        return []
+    rows = []
+    for place, (low, high) in enumerate(found["bands"]):
+        levels = ", ".join(f"{a} {quantity(v[place], 'm/s²')}" for a, v in found["rms"].items())
+        effect = quantity(found["height"][place], "m") if found["height"] else "not evaluated"
+        rows.append((f"{low:g} to {high:g} Hz", f"at most {levels}; on a height {effect} rms"))
+    total = found["height_total"]
+    said = "not evaluated: no calibration" if total is None else f"{quantity(total, 'm')} rms"
+    raised = f"alarm in {found['alarms']} of {found['spectra']} spectra"
+    return [("vibration", f"on a height at most {said}; {raised}"), *rows]
 
 
 COMMANDS = (Command("inspect", _declare, _act, _show),)

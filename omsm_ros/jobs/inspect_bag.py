@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.jobs.read_bag import Progress, no_progress
@@ -33,14 +34,19 @@ class StreamInspection:
 
 @dataclass(frozen=True)
 class Inspection:
-    """streams: by topic;  faults: what is wrong, in words for people."""
+    """streams: by topic;  faults: what is wrong, in words for people.
+
+    vibration: levels that the monitor told, see :func:`_vibration`; None where it told nothing
+    """
 
     streams: list[StreamInspection]
     faults: list[str] = field(default_factory=list)
+    vibration: dict[str, object] | None = None
 
     def entry(self) -> dict[str, object]:
         """Return the JSON values of this record."""
-        return {"topics": [asdict(stream) for stream in self.streams], "faults": self.faults}
+        topics = [asdict(stream) for stream in self.streams]
+        return {"topics": topics, "faults": self.faults, "vibration": self.vibration}
 
 
 def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspection:
@@ -63,8 +69,35 @@ def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspecti
             for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance"))
             if topic not in watches
         ]
+        vibration = _vibration(bag.vibration())
     streams = [_inspect(t, watches.get(t.role)) for t in topics]
-    return Inspection(streams, [*faults, *_faults(watches)])
+    return Inspection(streams, [*faults, *_faults(watches)], vibration)
+
+
+def _vibration(told: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
+    """Return the largest levels of all spectra that the monitor told; None of none.
+
+    rms: of each axis by band [m/s²];  height, height_total: effect on a height, rms [m], None
+    where no calibration told it;  alarms: spectra during which the alarm was raised
+    """
+    # Bands follow the sampling rate, so they are those of the last.
+    alike = [one for one in told if one["bands"] == told[-1]["bands"]]
+    if not alike:
+        return None
+    heights = [one for one in alike if one["height"] is not None]
+    return {
+        "spectra": len(told),
+        "alarms": sum(one["alarm"] for one in told),
+        "bands": alike[-1]["bands"],
+        "rms": {axis: _largest(one["rms"][axis] for one in alike) for axis in alike[-1]["rms"]},
+        "height": _largest(one["height"] for one in heights) if heights else None,
+        "height_total": max((one["height_total"] for one in heights), default=None),
+    }
+
+
+def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
+    """Return the largest of each band."""
+    return [float(max(band)) for band in zip(*levels, strict=True)]
 
 
 _NO_INDEX = (

@@ -35,6 +35,7 @@ _TOPICS = {
     topics.CALIBRATION_TOPIC: Calibration,
     topics.POINTS_TOPIC: PointCloud2,
     topics.PROBE_TOPIC: String,
+    topics.VIBRATION_TOPIC: String,
 }
 
 _FLUSH_PERIOD_S = 0.5

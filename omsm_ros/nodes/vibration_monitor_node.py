@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from omsm_msgs.msg import AccelerationBlock
+from std_msgs.msg import String
 
 from omsm_ros import quantities
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -22,10 +23,10 @@ from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.diagnostics import STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.topics import MessageInfo, listen
+from omsm_ros.nodes.topics import MessageInfo, listen, publish_on
 from omsm_ros.parameters import Parameter
 from omsm_ros.readable import quantity
-from omsm_ros.storage import conversions
+from omsm_ros.storage import conversions, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 
 PARAMETERS = (
@@ -41,7 +42,10 @@ PARAMETERS = (
 
 
 class VibrationMonitorNode(ManagedNode):
-    """Listens to ``acceleration`` and ``calibration``; speaks through its diagnostics."""
+    """Listens to ``acceleration`` and ``calibration``; tells levels on ``vibration``.
+
+    And through its diagnostics.
+    """
 
     def __init__(self) -> None:
         super().__init__("vibration_monitor", PARAMETERS)
@@ -66,7 +70,9 @@ class VibrationMonitorNode(ManagedNode):
             self._calibration = load_calibration(path)
 
     def activate(self, undo: ExitStack) -> None:
-        """Begin to listen."""
+        """Begin to listen, and to tell."""
+        self._told = 0
+        self._publisher = publish_on(self, undo, String, "vibration")
         listen(self, undo, AccelerationBlock, "acceleration", self._take)
 
     def _use(self, calibration: Calibration, _: int) -> None:
@@ -83,6 +89,11 @@ class VibrationMonitorNode(ManagedNode):
         if levels is not None and self._alarm.update(levels.total_effect) != was:
             text = "raised" if self._alarm.raised else "ended"
             self.get_logger().warning(f"vibration alarm {text}: {self._line(levels)}")
+        # Once for each spectrum, however short the blocks are.
+        if levels is not None and levels.windows != self._told:
+            self._told = levels.windows
+            told = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
+            self._publisher.publish(String(data=strict_json.text_of(told)))
 
     def _levels(self) -> Any:
         known = self._calibration

@@ -40,9 +40,11 @@ from omsm_ros.storage.recording.topics import (
     PROBE_TOPIC,
     REFERENCE_TOPIC,
     TOPIC_TYPES,
+    VIBRATION_TOPIC,
     AnyBag,
     CellBag,
 )
+from omsm_ros.storage.vibration_levels import vibration_levels
 
 _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     AXES_TOPIC: conversions.axis_block,
@@ -52,6 +54,7 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     CALIBRATION_TOPIC: conversions.calibration,
     POINTS_TOPIC: conversions.cloud_array,
     PROBE_TOPIC: conversions.probe_settings,
+    VIBRATION_TOPIC: vibration_levels,
 }
 
 _BLOCKS: dict[str, type] = {
@@ -198,6 +201,12 @@ class BagReader:
             if reported not in found:
                 found.append(reported)
         return found
+
+    def vibration(self) -> list[dict[str, Any]]:
+        """Each state of the levels that the vibration monitor told, in their order."""
+        if not self.count([VIBRATION_TOPIC]):
+            return []
+        return [told for _, told in self.records(VIBRATION_TOPIC)]
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
         """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.

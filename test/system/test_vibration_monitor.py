@@ -7,7 +7,7 @@ from omsm_msgs.msg import AccelerationBlock as AccelerationMessage
 from std_srvs.srv import Trigger
 
 from omsm_ros.core.samples.blocks import AccelerationBlock
-from omsm_ros.storage import conversions
+from omsm_ros.storage import bags, conversions
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -24,7 +24,9 @@ def test_the_emulated_cells_vibration_is_measured_and_warned_of(cell):
     }
     file = cell.folder / "wrong.yaml"
     file.write_text(yaml.safe_dump(wrong))
+    path = cell.folder / "scan.mcap"
     cell.processes.start("vibration_monitor", alarm=20e-9)
+    cell.processes.start("recorder", path=str(path))
     cell.start_emulator(disturbances=str(file), time_lapse=4.0)
     cell.start_driver()
     said = values(cell)
@@ -34,6 +36,14 @@ def test_the_emulated_cells_vibration_is_measured_and_warned_of(cell):
     assert float(said("line_frequency")) == pytest.approx(680.0, abs=1.5)
     assert float(said("height_500_2000_hz")) == pytest.approx(50e-9 / 2**0.5, rel=0.05)
     assert said("alarm") == "True"
+    recorded = lambda: cell.operator.value("recorder", "/omsm/vibration")  # noqa: E731
+    cell.wait("levels in the bag", lambda: recorded() >= 1)
+    cell.processes.end("recorder")
+    with bags.BagReader(path) as bag:
+        told = bag.vibration()[-1]
+    assert told["bands"][-1] == [500.0, 2000.0]
+    assert told["height"][-1] == pytest.approx(50e-9 / 2**0.5, rel=0.05)
+    assert told["line"]["frequency"] == pytest.approx(680.0, abs=1.5)
 
 
 def test_the_alarm_ends_when_it_is_quiet(cell):

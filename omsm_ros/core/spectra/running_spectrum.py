@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,18 @@ class VibrationLevels:
     effect: tuple[float, ...] | None
     total_effect: float | None
     windows: int
+
+    def entry(self) -> dict[str, Any]:
+        """Return JSON values, in SI: ``height`` is the effect by band, ``height_total`` of all."""
+        axis, frequency, amplitude = self.line
+        return {
+            "bands": [list(band) for band in self.bands],
+            "rms": {axis: list(levels) for axis, levels in self.rms.items()},
+            "line": {"axis": axis, "frequency": frequency, "amplitude": amplitude},
+            "height": None if self.effect is None else list(self.effect),
+            "height_total": self.total_effect,
+            "windows": self.windows,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

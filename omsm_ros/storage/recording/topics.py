@@ -17,6 +17,7 @@ ACCELERATION_TOPIC = "/omsm/acceleration"
 CALIBRATION_TOPIC = "/omsm/calibration"
 POINTS_TOPIC = "/omsm/points"
 PROBE_TOPIC = "/omsm/probe_settings"
+VIBRATION_TOPIC = "/omsm/vibration"
 
 TOPIC_TYPES = {
     AXES_TOPIC: "omsm_msgs/msg/AxisBlock",
@@ -26,6 +27,7 @@ TOPIC_TYPES = {
     CALIBRATION_TOPIC: "omsm_msgs/msg/Calibration",
     POINTS_TOPIC: "sensor_msgs/msg/PointCloud2",
     PROBE_TOPIC: "std_msgs/msg/String",
+    VIBRATION_TOPIC: "std_msgs/msg/String",
 }
 
 LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC, PROBE_TOPIC})
