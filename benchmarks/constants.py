@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.identification import record_once
+from omsm_ros.core.departures.hidden import PAPER_SCAN
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.identification.hidden_terms import PAPER_SCAN
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord

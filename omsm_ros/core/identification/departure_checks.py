@@ -37,9 +37,10 @@ _WORST_AGREEMENT = 2.5
 _AGREEMENT_SEGMENT_S = 1.0
 # A response that is the mean of fewer is known to a third at best.
 _LEAST_SEGMENTS = 8
-# Share of its size that a departure costs on a scan, as a standard uncertainty: backlash and
-# friction lag by their whole half width, a sine by its rms.
-_ON_SCAN = {BACKLASH: 1.0, FRICTION: 1.0, PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
+# Share of its size that a departure costs on a scan, as a standard uncertainty: a sine its rms.
+# Backlash and friction lag by their whole half widths together.
+_ON_SCAN = {PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
+_TURNING = (BACKLASH, FRICTION)
 _REMEDY = {
     CREEP: "let the joints of probe and target settle, and rest longer on each plateau",
     MODE: "look for what the machine stands on or carries loosely",
@@ -49,15 +50,15 @@ _REMEDY = {
     LINEARITY: "use less of the probe's range, or linearise the probe",
     PERIODIC: "make steps that are no multiple of that period",
     VIBRATION: "find what runs at this frequency, or isolate the machine from it",
-    DRIFT: "let the machine warm up, and shield it",
+    DRIFT: "let the machine warm up and its joints settle, and shield it",
 }
 
 
 def departures(searched: Searched) -> Finding:
     """Report the departures that were modelled, and those that could not be."""
     fit, problem = searched.model.chosen.fit, searched.prepared.problem
-    beside = _sizes(problem, fit, searched.beside)
-    costs = [
+    beside, turning = _sizes(problem, fit, searched.beside)
+    costs = [turning] + [
         _ON_SCAN.get(modelled.term.family, 0.0) * float(np.hypot(size, uncertainty))
         for modelled, (size, uncertainty) in zip(searched.beside, beside, strict=True)
     ]
@@ -102,21 +103,28 @@ def _entry(term: Term, size: float | None, uncertainty: float | None) -> dict[st
     }
 
 
-def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[tuple[float, float]]:
-    """Return the size of each modelled term and its standard uncertainty [m]."""
+def _sizes(
+    problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]
+) -> tuple[list[tuple[float, float]], float]:
+    """Return each modelled term's size and standard uncertainty [m]; what turning costs [m].
+
+    Backlash and friction look alike, and what one has too much the other has too little.
+    """
     if not beside:
-        return []
+        return [], 0.0
     columns = problem.sensitivity(fit)
     covariance = parameter_covariance(problem, columns, fit.residual)
     first = columns.shape[1] - problem.background.shape[1]
+    sides = np.zeros(problem.background.shape[1])
     found = []
     for modelled in beside:
         coefficients = fit.background[modelled.columns]
         part = slice(first + modelled.columns.start, first + modelled.columns.stop)
         spread = covariance[part, part]
-        if modelled.term.family in (BACKLASH, FRICTION):
+        if modelled.term.family in _TURNING:
             # The further column is its unknown state at the start.
             coefficients, spread = coefficients[:1], spread[:1, :1]
+            sides[modelled.columns.start] = 1.0
         if modelled.term.family == DRIFT:
             added = problem.background[:, modelled.columns] @ coefficients
             found.append((float(np.std(added)), float(np.sqrt(max(np.trace(spread), 0.0) / 2))))
@@ -124,7 +132,8 @@ def _sizes(problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]) -> list[t
         found.append(
             (float(np.linalg.norm(coefficients)), float(np.sqrt(max(np.trace(spread), 0.0))))
         )
-    return found
+    variance = max(float(sides @ covariance[first:, first:] @ sides), 0.0)
+    return found, float(np.hypot(sides @ fit.background, np.sqrt(variance)))
 
 
 def _words(term: Term, size: float | None) -> str:
@@ -142,7 +151,7 @@ def _words(term: Term, size: float | None) -> str:
         LINEARITY: f"the probe's scale changes over its range, by{large[3:]} at its ends",
         PERIODIC: f"an error{large} periodic in {length} of travel",
         VIBRATION: f"vibration{large} at {frequency}",
-        DRIFT: f"drift{large} rms during the test",
+        DRIFT: f"drift{large} rms during the test, or the beginning of a relaxation",
     }[term.family]
 
 

@@ -42,6 +42,9 @@ _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
 _UNDECIDED = 5.0
 # A decay slower than the record is a drift.
 _LEAST_DECAYS = 1.0
+# A ring that has decayed by fewer e-folds at the end of the record is still felt at its beginning,
+# where the period begins anew: a thousandth of it is left after seven.
+_FORGOTTEN_DECAYS = 7.0
 # A structure and its roll-off; what is not linear looks like many more.
 _PLAIN_POLES = 2
 # Two time constants a decade apart look much the same: the fit starts at several.
@@ -112,7 +115,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
                 refused.add(shown[0].term.family)
                 continue
             prepared, model = larger
-            grown.append(shown[0].term)
+            grown.append(_as_fitted(shown[0].term, model.chosen.fit))
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     return Searched(prepared, model, survey, beside, grown, survey.significant(settled))
 
@@ -132,11 +135,9 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
 
     What is not linear is not bent into poles where fewer of them and its own columns do better.
     """
-    chosen = model.chosen
-    plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
-    if chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
+    chosen, best = model.chosen, _best_plain(model)
+    if chosen.fit.structure.poles <= _PLAIN_POLES or best is None:
         return []
-    best = min(plain, key=lambda candidate: candidate.bic).fit
     survey = Survey(prepared.problem, best, prepared.steps, _BESIDE)
     columns = _beside(survey, survey.significant())
     if not columns:
@@ -160,7 +161,10 @@ def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
         if {first.term.family, other.term.family} <= _SLOW
         and survey.evidence(other) > survey.evidence(first) - _UNDECIDED
     ]
-    return [judged for judged in (first, *equals) if judged.term.family in _BESIDE]
+    chosen = [judged for judged in (first, *equals) if judged.term.family in _BESIDE]
+    turning = [judged for judged in chosen if judged.term.family in _TURNING]
+    # Backlash and friction look so much alike that both at once cancel at any size.
+    return [judged for judged in chosen if judged not in turning[1:]]
 
 
 def _with_columns(
@@ -197,31 +201,64 @@ def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Mode
     """Return the model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
         return None
-    problem = prepared.problem
-    if term.family == CREEP:
-        # What is slower than the record has not settled when a period begins anew.
+    problem, new = prepared.problem, _poles(term)
+    decays = float(np.min(-new.real)) * len(problem.input) * problem.period
+    if term.family == CREEP or decays < _FORGOTTEN_DECAYS:
+        # What has not died away at the end has not when a period begins anew.
         problem = replace(problem, fits_initial_condition=True)
-    before, new = model.chosen.fit, _poles(term)
-    zeros, delay = before.structure.zeros + len(new), before.structure.delay
-    larger = Structure(before.structure.poles + len(new), zeros, delay)
+    starts = _FASTER if term.family == CREEP else (1.0,)
+    tried = [_with_poles(problem, base, new, starts) for base in _bases(model)]
+    # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
+    found = [c for c in tried if c is not None and _decays(c.fit, problem)]
+    best = min(found, key=lambda candidate: candidate.bic, default=None)
+    if best is None or best.bic >= information(model.chosen.fit):
+        return None
+    grown = replace(model, chosen=best, candidates=[*model.candidates, best])
+    return replace(prepared, problem=problem), grown
+
+
+def _as_fitted(term: Term, fitted: Fit) -> Term:
+    """Return ``term`` with the time constant [s] or frequency [Hz] of the pole that it became."""
+    poles = fitted.dynamics.poles()
+    near = np.abs(np.log(poles / _poles(term)[0]))
+    pole = poles[int(np.argmin(near))]
+    parameter = 1 / abs(pole) if term.family == CREEP else abs(pole) / (2 * np.pi)
+    return replace(term, parameter=float(parameter), damping=float(-pole.real / abs(pole)))
+
+
+def _bases(model: Model) -> list[Fit]:
+    """Return the fits that a pole may be added to: the chosen one, and the best plain one."""
+    chosen = model.chosen.fit
+    plain = _best_plain(model)
+    return [chosen] if plain is None or plain is chosen else [chosen, plain]
+
+
+def _best_plain(model: Model) -> Fit | None:
+    """Return the best fit of a structure and its roll-off alone, if one was tried."""
+    plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
+    return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
+
+
+def _with_poles(
+    problem: Problem, base: Fit, new: ComplexArray, starts: Sequence[float]
+) -> Candidate | None:
+    """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them."""
+    zeros, delay = base.structure.zeros + len(new), base.structure.delay
+    larger = Structure(base.structure.poles + len(new), zeros, delay)
     if larger.poles > MAX_POLES:
         return None
     scaled = Scaled(larger, problem.rate)
-    late = float(before.nonlinear[-1]) if delay else 0.0
-    own = before.dynamics.poles()
+    late = float(base.nonlinear[-1]) if delay else 0.0
+    own = base.dynamics.poles()
     found = fit(
         problem,
         larger,
         [
             scaled.nonlinear_of(_scaled([own, faster * new], problem.rate), late)
-            for faster in (_FASTER if term.family == CREEP else (1.0,))
+            for faster in starts
         ],
     )
-    candidate = Candidate(found, information(found))
-    if candidate.bic >= information(before) or not _decays(found, problem):
-        return None
-    grown = replace(model, chosen=candidate, candidates=[*model.candidates, candidate])
-    return replace(prepared, problem=problem), grown
+    return Candidate(found, information(found))
 
 
 def _scaled(poles: Sequence[ComplexArray], rate: float) -> ComplexArray:

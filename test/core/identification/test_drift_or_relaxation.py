@@ -5,11 +5,11 @@ import pytest
 from late_steps import LAG, LATE, PERIOD, TIME, late_record
 
 from omsm_ros.core.departures.families import DRIFT, relaxed
+from omsm_ros.core.departures.hidden import hidden_terms, without_drift
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import response_band
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.departure_search import search
-from omsm_ros.core.identification.hidden_terms import hidden_terms, without_drift
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
 
