@@ -120,6 +120,12 @@ class ChrocodileDevice(Chrocodile):
         early, self._early = self._early, []
         return self._converted(early + self._stream.feed(data))
 
+    def _ahead(self) -> float:
+        """A telegram counts when the next one has begun, so it had come a sample before."""
+        decoder = self._stream.decoder
+        binary = isinstance(decoder, BinaryDecoder)
+        return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
+
     def _rest(self) -> Samples:
         return self._converted(self._stream.settle())
 

@@ -16,6 +16,7 @@ from omsm_ros.devices.blocks import BlockCutter, BlockPair, BlockSettings, Chann
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples, SequenceTracker
 from omsm_ros.devices.transport import Transport
 from omsm_ros.errors import NoSamplesError
+from omsm_ros.units import NANOSECONDS_PER_S
 
 # Bytes without a sample for so long are another device's, or come at another baud rate.
 UNREADABLE_S = 2.0
@@ -80,6 +81,7 @@ class StreamDevice:
         self._cutter = BlockCutter(settings, channels)
         self._decoded = 0
         self._heard = self._opened = monotonic()
+        self._came_ns = 0  # when the last bytes did
         self._down = False
         self._renewals = 0
 
@@ -98,6 +100,7 @@ class StreamDevice:
         """
         data = self._transport.read(timeout)
         arrival_ns, now = self._now_ns(), self._monotonic()
+        self._came_ns = arrival_ns if data or not self._came_ns else self._came_ns
         samples = self._decode(data)
         silent = now - self._heard
         if len(samples):
@@ -180,6 +183,10 @@ class StreamDevice:
         """Return a sample that was complete, but waited for what follows it; shape (n,)."""
         return np.empty(0, SAMPLE)
 
+    def _ahead(self) -> float:
+        """By how many samples that which has arrived is ahead of what was decoded."""
+        return 0.0
+
     def _listen_in(self, silent: float) -> None:
         """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
 
@@ -201,11 +208,13 @@ class StreamDevice:
         after_silence = self._down or silent > self._settings.pause
         self._down = False
         runs = list(self._tracker.split(samples, silent, broken=after_silence))
-        return list(self._cutter.add(runs, arrival_ns, after_silence=after_silence))
+        waited = self._ahead() * self._settings.sample_period
+        came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
+        return list(self._cutter.add(runs, came_ns, after_silence=after_silence))
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
         """Return everything that waited, now that nothing follows."""
         rest = self._rest()
-        blocks = self._add(rest, arrival_ns, 0.0) if len(rest) else []
+        blocks = self._add(rest, self._came_ns or arrival_ns, 0.0) if len(rest) else []
         blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)
         return [*blocks, *self._cutter.flush()]

@@ -99,8 +99,10 @@ class PacketDecoder:
         if kind not in KINDS or not HEADER.size < length <= MAX_PACKET_BYTES:
             return 0
         after = self._buffer[place + length :][: len(MAGIC_BYTES)]
-        if self._cut_off(place, length) or not MAGIC_BYTES.startswith(after):
-            return 0  # too short or too long: what follows is no packet
+        # Samples have no check of their own; what follows shows whether they are too many or few.
+        ends = kind != DATA or MAGIC_BYTES.startswith(after)
+        if self._cut_off(place, length) or not ends:
+            return 0
         return length if place + length <= len(self._buffer) else None
 
     def _cut_off(self, place: int, length: int) -> bool:

@@ -221,9 +221,12 @@ class BlockDecoder:
         after = self._buffer[end:][: len(PREAMBLES[0])]
         if not any(preamble.startswith(after) for preamble in PREAMBLES):
             return True
-        head = self._buffer[place : place + 12]  # preamble and the controller's own numbers
-        inside = self._buffer.find(head, place + 1, end + len(head) - 1)
-        return 0 <= inside < end
+        inside = self._find(place + 1)
+        while 0 <= inside < end and inside + self._header.size <= len(self._buffer):
+            if self._shape(self._header.unpack_from(self._buffer, inside)) is not None:
+                return True
+            inside = self._find(inside + 1)
+        return False
 
     def _block(self, place: int, size: int) -> Block:
         fields = self._header.unpack_from(self._buffer, place)
