@@ -24,6 +24,7 @@ LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, and that it ends with."""
 
 _BAD_INPUT = 2
+_M_ARENA_MAX = -8  # of <malloc.h>
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OTHER_NAMES = {"replay": "player"}
 _NO_ROS = (
@@ -42,6 +43,7 @@ def main() -> None:
     name = Path(sys.argv[0]).stem
     with nothing_to_undo():
         end_with_launch()
+        share_one_pool()
         for package, remedy in _NEEDED.items():
             try:
                 importlib.import_module(package)
@@ -66,6 +68,13 @@ def end_with_launch() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
         sys.exit(f"the launch that started this node ({launch}) has ended")
+
+
+def share_one_pool() -> None:
+    """Let all threads share one pool of memory; each of the middleware's would keep its own."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc has it
+    if mallopt is not None:
+        mallopt(_M_ARENA_MAX, 1)
 
 
 @contextmanager

@@ -16,6 +16,9 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 B = TypeVar("B", AxisBlock, DistanceBlock)
 
+MOST_TOGETHER = 500
+"""Samples: a longer block costs little less a sample, and queues keep room for the message it makes."""
+
 # Stamps within one block are those of its first sample and the period; they are moved no further.
 _STAMP_TOLERANCE_S = 1e-3
 _NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
@@ -36,12 +39,13 @@ def consecutive(blocks: Sequence[B]) -> list[list[B]]:
     """Return the blocks in their order, those in one list that :func:`joined` can make one.
 
     They have consecutive counts, one period, the same channels, and stamps that continue the
-    first one's.
+    first one's; beyond MOST_TOGETHER samples a list has one block.
     """
     runs: list[list[B]] = []
     length = 0
     for block in blocks:
-        if runs and _continues(runs[-1][0], length, block):
+        fits = length + len(block) <= MOST_TOGETHER
+        if runs and fits and _continues(runs[-1][0], length, block):
             runs[-1].append(block)
             length += len(block)
         else:

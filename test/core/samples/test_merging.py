@@ -11,7 +11,7 @@ from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import join_points, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.samples.merging import consecutive, joined
+from omsm_ros.core.samples.merging import MOST_TOGETHER, consecutive, joined
 
 PERIOD = 1e-3
 
@@ -50,6 +50,14 @@ def test_single_samples_become_one_block() -> None:
     (block,) = merged(cut(z, list(range(51)), jitter_ns=400_000))
     assert np.array_equal(block.z, z)
     assert (block.first_sample, len(block)) == (0, 50)
+
+
+def test_no_more_than_so_many_samples_become_one_block() -> None:
+    """A node that had stood still publishes no cloud of minutes."""
+    z = np.arange(10_250.0)
+    blocks = merged(cut(z, [*range(0, 8001, 100), 10_000, 10_250]))
+    assert np.array_equal(np.concatenate([block.z for block in blocks]), z)
+    assert [len(block) for block in blocks] == [MOST_TOGETHER] * 16 + [2000, 250]
 
 
 @pytest.mark.parametrize("gap", ["count", "stamp", "period"])
