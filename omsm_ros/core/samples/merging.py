@@ -17,7 +17,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 B = TypeVar("B", AxisBlock, DistanceBlock)
 
 MOST_TOGETHER = 500
-"""Samples: a longer block costs little less a sample, and queues keep room for the message it makes."""
+"""Samples: longer blocks cost little less a sample; queues keep room for the messages they make."""
 
 # Stamps within one block are those of its first sample and the period; they are moved no further.
 _STAMP_TOLERANCE_S = 1e-3
