@@ -86,6 +86,19 @@ def test_missing_serial_port_is_named() -> None:
         SerialTransport("/dev/no-such-port", 115_200).open()
 
 
+def test_a_serial_port_that_may_not_be_opened_is_named(pair: tuple[FileIO, str]) -> None:
+    mode, user = os.stat(pair[1]).st_mode, os.geteuid()
+    os.chmod(pair[1], 0)
+    try:
+        if user == 0:
+            os.seteuid(65_534)  # root may open anything
+        with pytest.raises(DeviceError, match=r"Permission denied.*membership of group dialout"):
+            SerialTransport(pair[1]).open()
+    finally:
+        os.seteuid(user)
+        os.chmod(pair[1], mode)
+
+
 def test_lost_serial_port_raises_and_says_what_to_do(
     pair: tuple[FileIO, str], serial_transport: SerialTransport
 ) -> None:
