@@ -119,7 +119,7 @@ def shown(value: object) -> str:
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
 
 
-# ------------------------------------------------------------------------- sampled data
+# Sampled data.
 
 SAMPLE_PERIOD = Quantity("sample period", "s", 1e-7, 10.0, "give it in seconds")
 # Beyond it a float no longer tells neighbours apart; at 1 MHz it lasts 285 years.
@@ -141,7 +141,7 @@ TIME = Quantity("time", "s", -1e10, 1e10, "give it in seconds")
 WAIT = Quantity("waiting time", "s", 1e-3, 60.0, "give it in seconds")
 DURATION = Quantity("duration", "s", 0.0, 1e7, "give it in seconds; 0 = all")
 
-# ------------------------------------------------------------------------------ dynamics
+# Dynamics.
 
 DELAY = Quantity("delay", "s", 0.0, 1.0, "identify again; the loop's delay is milliseconds")
 # Drift over minutes is no dynamics of a servo; a nanosecond is beyond every sensor.
@@ -152,7 +152,7 @@ GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and pr
 MAX_DELAY_SAMPLES = Quantity("longest delay", "samples", 0, 50, "0 = none", whole=True)
 ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
 
-# ------------------------------------------------------------------- machine and surface
+# Machine and surface.
 
 LENGTH = Quantity("length", "m", -10.0, 10.0, "give it in metres")
 RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if convex", signed=True)
@@ -179,7 +179,7 @@ CLOUD_POINTS = Quantity(
 )
 STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
 
-# --------------------------------------------------------------------------- uncertainty
+# Uncertainty.
 
 UNCERTAINTY = Quantity("standard uncertainty", "m", 0.0, 10.0, "give it in metres, k = 1")
 TIME_UNCERTAINTY = Quantity("standard uncertainty", "s", 0.0, 1.0, "give it in seconds, k = 1")
@@ -204,7 +204,7 @@ STAMP_TOLERANCE = Quantity("stamp tolerance", "s", 0.0, 10.0, "give it in second
 STAMP_DELAY = Quantity("delay of the exposure", "s", -10.0, 10.0, "give it in seconds")
 EXPOSURE = Quantity("exposure", "s", 0.0, 10.0, "give it in seconds")
 
-# ------------------------------------------------------------------- arguments, parameters
+# Arguments, parameters.
 
 DWELL = Quantity("dwell", "s", 1e-6, 100.0, "give it in seconds")
 RISE = Quantity("rise", "s", 1e-7, 100.0, "give it in seconds")
@@ -227,7 +227,7 @@ SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")
 HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
 SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")
 
-# ------------------------------------------------------------------------------- devices
+# Devices.
 
 BAUD_RATE = Quantity("baud rate", "bit/s", 50, 50_000_000, "as the device has it", whole=True)
 SILENCE = Quantity("silence", "s", 0.0, 86_400.0, "0 = as long as it may be")

@@ -9,6 +9,7 @@ reader is to type back stays in the unit of its field instead.
 from __future__ import annotations
 
 import math
+from datetime import datetime, timezone
 
 NOTHING = "–"
 # Nothing smaller than nano: lengths below it are read as 0.31 nm.
@@ -155,3 +156,8 @@ def _fixed(rounded: float, digits: int, exponent: int) -> str:
     magnitude = math.floor(math.log10(abs(rounded)))
     decimals = max(digits - 1 - (magnitude - exponent), 0)
     return f"{rounded / 10.0**exponent:.{decimals}f}"
+
+
+def moment(when: datetime) -> str:
+    """Return a date and time for a page, "2026-01-31 23:59 UTC"; ``when`` knows its time zone."""
+    return when.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from datetime import datetime, timedelta, timezone
 
 import pytest
 from hypothesis import given
@@ -16,6 +17,7 @@ from omsm_ros.readable import (
     expanded,
     figure,
     measured,
+    moment,
     number,
     percent,
     plain,
@@ -194,3 +196,8 @@ def test_a_share_in_per_cent(share, digits, text):
 def test_a_chance_in_a_sentence():
     assert chance(0.234567) == "p = 0.235"
     assert chance(1e-300) == "p < 0.0001"
+
+
+def test_a_moment_is_given_in_utc():
+    summer = timezone(timedelta(hours=2))
+    assert moment(datetime(2026, 7, 1, 1, 30, tzinfo=summer)) == "2026-06-30 23:30 UTC"

@@ -18,8 +18,6 @@ from omsm_ros.storage.machine_files import save_geometry
 # Beyond it nine tenths of the mean square are something else than noise.
 _NOT_NOISE = 3.0
 
-# --------------------------------------------------------------------------------- align
-
 
 def _declare_align(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag", help="a scan of a reference sphere")

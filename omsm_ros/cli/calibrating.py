@@ -35,8 +35,6 @@ from omsm_ros.units import DEGREE_RAD
 
 # A second height that is no simple part of the first: 3 µm beside 9.8 µm.
 
-# -------------------------------------------------------------------------------- verify
-
 
 def _declare_verify(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
@@ -91,9 +89,6 @@ def _show_verify(facts: Facts) -> None:
     print("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
 
 
-# ------------------------------------------------------------------------------- compare
-
-
 def _declare_compare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("old", type=Path, metavar="OLD.json")
     sub.add_argument("new", type=Path, metavar="NEW.json")
@@ -120,9 +115,6 @@ def _repeatability_facts(found: Repeatability) -> Facts:
         for name, value in asdict(found).items()
     }
     return arrays | {"text": found.text()}
-
-
-# ---------------------------------------------------------------------------------- plan
 
 
 def _declare_plan(sub: argparse.ArgumentParser) -> None:
@@ -188,8 +180,6 @@ def _show_plan(facts: Facts) -> None:
         ]
     )
 
-
-# -------------------------------------------------------------------------------- calset
 
 _PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
 

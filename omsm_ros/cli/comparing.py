@@ -15,7 +15,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.compare_measurements import (
     DIFFERENCE,
     MAP,
-    Ways,
+    ComparisonOptions,
     compare_measurements,
     write_difference,
 )
@@ -23,8 +23,6 @@ from omsm_ros.readable import count, figure, percent, plain, quantity
 from omsm_ros.storage.files import REPORT
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
-
-# ---------------------------------------------------------------------------- difference
 
 
 def _freedoms(text: str) -> tuple[str, ...]:
@@ -82,7 +80,7 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
 def _difference(args: argparse.Namespace) -> Facts:
     if args.register and args.nominal is None:
         raise ConfigurationError("--register needs the surface; give --nominal SURFACE.yaml")
-    ways = Ways(
+    options = ComparisonOptions(
         freedoms=args.fit,
         uncertainty=args.uncertainty,
         drift=args.drift,
@@ -92,7 +90,7 @@ def _difference(args: argparse.Namespace) -> Facts:
         register=args.register,
     )
     nominal = load_surface(args.nominal) if args.nominal else None
-    found, facts = compare_measurements(args.a, args.b, ways, nominal)
+    found, facts = compare_measurements(args.a, args.b, options, nominal)
     with result_folder(args.out, (MAP, REPORT, DIFFERENCE)) as out:
         write_difference(out, found, facts)
     return {**facts, "files": {"difference": DIFFERENCE, "map": MAP, "report": REPORT}}

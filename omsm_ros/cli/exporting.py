@@ -29,8 +29,6 @@ UNIT: dict[str, Any] = {
     "help": "of files that do not carry it, as mm, or mm,nm",
 }
 
-# -------------------------------------------------------------------------------- export
-
 
 def _declare_export(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("source", type=Path, help="a result folder, a cloud or a map of any format")

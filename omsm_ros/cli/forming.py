@@ -25,8 +25,6 @@ from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import DEGREE_RAD
 
-# ---------------------------------------------------------------------------------- form
-
 
 _WRITTEN = (CLOUD, SYSTEMATIC, SUMMARY, DEVIATION, CURVES, FORM, REPORT)
 
@@ -77,9 +75,6 @@ def _show_form(facts: Facts) -> None:
     table([*verdict, *form_rows(facts), ("written", ", ".join(written))])
 
 
-# ---------------------------------------------------------------------------- compensate
-
-
 def _declare_compensate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("measured", type=Path, help="result folder, cloud or map")
     sub.add_argument("--nominal", type=Path, required=True, metavar="SURFACE.yaml")
@@ -122,9 +117,6 @@ def _show_compensate(facts: Facts) -> None:
     table(
         [*rows, ("sign", facts["sign"]), ("written", f"{facts['file']}, {facts['places']} places")]
     )
-
-
-# ------------------------------------------------------------------------------- surface
 
 
 def _declare_surface(sub: argparse.ArgumentParser) -> None:

@@ -213,9 +213,6 @@ def _show(facts: Facts) -> None:
     table(rows)
 
 
-# ------------------------------------------------------------------------------ validate
-
-
 def _declare_validate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("model", type=Path, metavar="MODEL.json")
     sub.add_argument(

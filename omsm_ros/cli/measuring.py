@@ -57,9 +57,6 @@ def geometry_of(path: Path | None) -> Geometry:
     return load_geometry(path) if path else Geometry()
 
 
-# ------------------------------------------------------------------------------- correct
-
-
 def _declare_correct(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag")
     sub.add_argument("--calibration", **CALIBRATION)
@@ -187,9 +184,6 @@ def _show_correct(summary: Facts) -> None:
     if "form" in summary:
         rows += form_rows(summary["form"])
     table([*rows, ("written", ", ".join(summary["files"].values()))])
-
-
-# ------------------------------------------------------------------------------- predict
 
 
 def _declare_predict(sub: argparse.ArgumentParser) -> None:

@@ -27,8 +27,6 @@ from omsm_ros.readable import measured, percent, quantity
 from omsm_ros.storage.calibration_file import load_calibration, save_calibration
 from omsm_ros.units import RPM_RAD_S
 
-# ------------------------------------------------------------------------------- selfcal
-
 
 def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more of one part")
@@ -142,9 +140,6 @@ def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
     ]
 
 
-# ------------------------------------------------------------------------------ reversal
-
-
 def _declare_reversal(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "clockwise", "counterclockwise")
     sub.add_argument("--calibration", **CALIBRATION)
@@ -185,9 +180,6 @@ def _show_reversal(facts: Facts) -> None:
             ("written to", facts.get("calibration", "nowhere; give --out to use it")),
         ]
     )
-
-
-# ------------------------------------------------------------------------------- latency
 
 
 def _declare_latency(sub: argparse.ArgumentParser) -> None:

@@ -13,8 +13,6 @@ from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.surface_file import load_surface
 
-# ------------------------------------------------------------------------------ spectrum
-
 
 def _declare_spectrum(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "scans", nargs="+", metavar="SCAN", help="bags of one part")

@@ -11,6 +11,7 @@ from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.sampled.free_run import FreeRun
 from omsm_ros.core.sampled.model import SampledModel
 from omsm_ros.jobs.identify_table import SampledRecord
+from omsm_ros.readable import moment
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
 from omsm_ros.report.certificate.model_page import ModelPage, model_figures_of, render_model
 from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
@@ -63,4 +64,4 @@ def write_model_page(
 
 
 def _today() -> str:
-    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return moment(datetime.now(timezone.utc))

@@ -17,14 +17,17 @@ from omsm_ros.core.comparison.agreement import (
     Number,
     figures_of,
 )
+from omsm_ros.core.comparison.cells import TREND_DEGREE
 from omsm_ros.core.comparison.compare import Comparison, Side, compare
 from omsm_ros.core.comparison.matching import SEATED
+from omsm_ros.core.comparison.resampling import RADIUS_CELLS
 from omsm_ros.core.comparison.stated_errors import Measurement
 from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.jobs.registered_points import registered
+from omsm_ros.readable import moment
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import (
     REPORT,
@@ -41,13 +44,13 @@ from omsm_ros.storage.result_folder import read_result
 DIFFERENCE, MAP = "difference.json", "difference.csv"
 
 _METHOD = (
-    "local quadratic regression on means of square cells, tricube weights over 2.4 cells, "
-    "beside a polynomial of degree 6"
+    "local quadratic regression on means of square cells, tricube weights over "
+    f"{RADIUS_CELLS:g} cells, beside a polynomial of degree {TREND_DEGREE}"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ways:
+class ComparisonOptions:
     """How two measurements are compared.
 
     freedoms: in which the second is moved onto the first
@@ -67,26 +70,26 @@ class Ways:
     register: Sequence[str] | None = None
 
 
-def measurement_at(path: Path, ways: Ways, nominal: Surface | None) -> Measurement:
+def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | None) -> Measurement:
     """Read a result folder, a cloud or a map, less the ``nominal`` heights if there are any.
 
     Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
     """
-    points = read_points(path, ways.units)
-    if nominal is not None and ways.register is None:
+    points = read_points(path, options.units)
+    if nominal is not None and options.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)
     measured = Measurement(
         name=str(path),
         points=points,
         fields=_fields_beside(path, points),
-        common=ways.uncertainty if points.uncertainty is None else None,
-        drift=ways.drift,
+        common=options.uncertainty if points.uncertainty is None else None,
+        drift=options.drift,
         calibration=_calibration_of(path),
     )
-    if nominal is None or ways.register is None:
+    if nominal is None or options.register is None:
         return measured
-    return registered(measured, nominal, ways.register)
+    return registered(measured, nominal, options.register)
 
 
 def _calibration_of(path: Path) -> str:
@@ -109,11 +112,11 @@ def _fields_beside(path: Path, points: MeasuredPoints) -> ScanFields | None:
 
 
 def compare_measurements(
-    a: Path, b: Path, ways: Ways, nominal: Surface | None
+    a: Path, b: Path, options: ComparisonOptions, nominal: Surface | None
 ) -> tuple[Comparison, dict[str, Any]]:
     """Compare two measurements, and return what was found with the content of its JSON."""
-    measured = [measurement_at(path, ways, nominal) for path in (a, b)]
-    found = compare(*measured, ways.freedoms, ways.spacing, ways.length)
+    measured = [measurement_at(path, options, nominal) for path in (a, b)]
+    found = compare(*measured, options.freedoms, options.spacing, options.length)
     facts = facts_of(found)
     for key, m in zip(("a", "b"), measured, strict=True):
         facts[key]["notes"] = list(m.points.notes)
@@ -131,7 +134,7 @@ def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> Non
     # Here, because drawing takes longer to load than most of the rest.
     from omsm_ros.report.difference.page import render
 
-    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    date = moment(datetime.now(timezone.utc))
     names = [Path(facts[key]["file"]).name for key in ("a", "b")]
     save_text(out / REPORT, render(" and ".join(names), date, facts, found))
     save_json(out / DIFFERENCE, facts)

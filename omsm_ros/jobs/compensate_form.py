@@ -19,7 +19,10 @@ from omsm_ros.storage.files import save_text
 COMPENSATION, PATH = "compensation.csv", "compensation.nc"
 # Of its standard uncertainty: an offset beyond it is there at 95 %.
 _SURE = 2.0
+# Of the area; with less of it sure, the cut follows the noise of the measurement.
 _LEAST_SURE = 0.5
+# Of the rms before; a cut that leaves more is hardly worth it.
+_MOST_LEFT = 0.9
 _HEAD = "x_m,y_m,offset_m,uncertainty_m\n"
 
 
@@ -47,7 +50,7 @@ def compensate_form(
     lines = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
     save_text(out / COMPENSATION, _HEAD + "\n".join(lines) + "\n")
     path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
-    largest = np.abs(found.offset[known]) > _SURE * found.uncertainty[known]
+    sure = np.abs(found.offset[known]) > _SURE * found.uncertainty[known]
     return {
         "file": COMPENSATION,
         **path,
@@ -58,8 +61,8 @@ def compensate_form(
         "rms_after": found.after,
         "largest_offset": float(np.max(np.abs(found.offset[known]))),
         "largest_uncertainty": float(np.max(found.uncertainty[known])),
-        "surer_than_zero": float(np.mean(largest)),
-        "warnings": _warnings(float(np.mean(largest)), found.before, found.after),
+        "surer_than_zero": float(np.mean(sure)),
+        "warnings": _warnings(float(np.mean(sure)), found.before, found.after),
         "sign": "add offset_m to the height of the surface that is cut, along z, positive away from"
         " the part; x and y are those of the nominal surface",
         "not_evaluated": [] if measured.systematic else ["systematic errors of the measurement"],
@@ -80,7 +83,7 @@ def _warnings(sure: float, before: float, after: float) -> list[str]:
             "cut would put errors of the measurement onto the part; measure with less, hold "
             "freedoms (--fit piston,tip,tilt), or take a longer --low-pass"
         )
-    if after > 0.9 * before:
+    if after > _MOST_LEFT * before:
         found.append(
             f"the cut would leave {quantity(after, 'm')} rms of {quantity(before, 'm')}: the rest "
             "is finer than --low-pass"

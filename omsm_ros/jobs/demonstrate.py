@@ -153,7 +153,7 @@ class Demonstration:
 
         OmsmError if it holds anything, and is not the folder of a demonstration.
         """
-        _ = self.disturbances  # a file that cannot be read is told before anything is cleared
+        _ = self.disturbances  # a file that cannot be read is reported before anything is cleared
         self.out.mkdir(parents=True, exist_ok=True)
         mark = self.out / _MARK
         # A scan and a calibration of a real machine have the same names.
@@ -279,9 +279,6 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
     )
     bode = response_figures.bode(calibration, true_response(step), period)
     return {"bode": style.png(bode), "step_response": style.png(edges)}
-
-
-# ----------------------------------------------------------------------------------- table
 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:

@@ -178,5 +178,5 @@ def _disk(folder: Path) -> Check:
     hours = shutil.disk_usage(there).free / _BYTES_PER_HOUR
     found = f"room for {hours:.0f} hours of recording at 1 kHz in {there}"
     if hours < _ENOUGH_HOURS:
-        return Check("disk", DOUBTFUL, found, "free some, or record elsewhere")
+        return Check("disk", DOUBTFUL, found, "free some space, or record elsewhere")
     return Check("disk", FINE, found)

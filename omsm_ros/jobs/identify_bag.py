@@ -15,8 +15,6 @@ from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 
-# ------------------------------------------------------------------------ identification
-
 
 def motion_of_bag(
     path: AnyBag,

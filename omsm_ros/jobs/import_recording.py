@@ -101,7 +101,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
 
 
 def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
-    """Raise DataError unless each stream is whole and comes from files of one kind."""
+    """Raise FileError unless each stream is whole and comes from files of one kind."""
     for channel in mapped.columns:
         if not mapped.has(channel) or channel in COUNTING:
             continue
@@ -175,7 +175,7 @@ class _Source:
             )
 
     def _check_units(self) -> None:
-        """Raise DataError where the map contradicts what the file itself says of a unit."""
+        """Raise FileError where the map contradicts what the file itself says of a unit."""
         for channel in self.channels:
             column = self._mapped.columns[channel]
             stated = stated_unit(self._table, column.name)

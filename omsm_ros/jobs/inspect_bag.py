@@ -11,6 +11,11 @@ from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import relative
 
+_NO_INDEX = (
+    "it has no index: its recording was ended hard, or the disk was full, so the last moments may "
+    "be missing; 'omsm inspect --repair' makes a copy with one"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class StreamInspection:
@@ -98,12 +103,6 @@ def _vibration(told: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
 def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
     """Return the largest of each band."""
     return [float(max(band)) for band in zip(*levels, strict=True)]
-
-
-_NO_INDEX = (
-    "it has no index: its recording was ended hard, or the disk was full, so the last moments may "
-    "be missing; 'omsm inspect --repair' makes a copy with one"
-)
 
 
 def _faults(watches: dict[str, StreamWatch]) -> Iterator[str]:

@@ -86,9 +86,6 @@ def keep(address: str, path: Path) -> bool:
     return keep_calibration(address, load_calibration(path), path)
 
 
-# ---------------------------------------------------------------------------------- history
-
-
 @dataclass(frozen=True, slots=True)
 class MachineHistory:
     """One machine: its calibrations and measurements, and how its dynamics and results drift.

@@ -73,9 +73,6 @@ def _calibrated(seed: int) -> Calibration:
     return identify(planned_test_of(Scenario(seed=seed)).motion_record()).calibration
 
 
-# ---------------------------------------------------------------------------- Fig. 9, chirp
-
-
 def _chirp(out: Path, seed: int) -> _Done:
     motion = Chirp()
     calibration = _calibrated(seed)
@@ -110,9 +107,6 @@ def _chirp(out: Path, seed: int) -> _Done:
         captions={"chirp": "Only bands of a hertz that the motion excites are shown."},
         figures={"chirp": style.png(figures.chirp(time, check, true_lag))},
     ))  # fmt: skip
-
-
-# --------------------------------------------------- Fig. 10 and Table 1, circles; Fig. 11
 
 
 def circle_scan(name: str, seed: int) -> Recording:
@@ -203,9 +197,6 @@ def _spectrum_page(
     facts = {"spectrum": summary_of(scans, SpectrumOptions())}
     captions = {name: CAPTIONS[name] for name in kept}
     return _Done(facts, ExperimentPage(title, summary, rows, (table,), captions, kept))
-
-
-# --------------------------------------------------------------------------- Fig. 8, mirror
 
 
 def _mirror(out: Path, seed: int) -> _Done:

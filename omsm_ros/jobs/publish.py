@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.readable import moment
 from omsm_ros.report.common import style
 from omsm_ros.report.common.response_figures import bode
 from omsm_ros.report.maps.surface_map import EmbeddedMap, Layer, embedded
@@ -90,7 +91,7 @@ def publish(
     form, curves = _json_in(out, FORM), _json_in(out, CURVES)
     if form:
         figures = {**figures, **form_figures(form, curves)}
-    date = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    date = moment(datetime.now(timezone.utc))
     page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
     save_text(out / REPORT, page)
 

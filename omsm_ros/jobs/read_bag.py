@@ -14,7 +14,7 @@ MOST_JUDGED = 2**20
 """Samples of a path that are judged: a quarter of an hour at 1 kHz, of a spiral the fastest."""
 
 Progress = Callable[[int, int], None]
-"""Called with messages done and messages in all."""
+"""Called with what is done and what there is in all: messages, lines or bags."""
 
 
 def no_progress(done: int, total: int) -> None:
@@ -34,7 +34,12 @@ def read_blocks(
     return found
 
 
-# ------------------------------------------------------------------------------- preview
+def sample_period_in(path: AnyBag) -> float:
+    """Return the sample period of the probe in a bag [s]; BagError without samples of it."""
+    with bags.BagReader(path) as bag:
+        for _, block in bag.records(bags.DISTANCE_TOPIC):
+            return float(block.sample_period)
+    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
 
 
 def path_in(path: AnyBag, progress: Progress = no_progress) -> ScanPath:

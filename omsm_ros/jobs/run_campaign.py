@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 
 from omsm_ros import __version__
 from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import SUMMARY, read_text, said, save_json
@@ -81,10 +82,6 @@ class Entry:
     recorded_ns: int | None = None
 
 
-Progress = Callable[[int, int], None]
-"""Called with the bags that are finished and their number in all."""
-
-
 def run_campaign(
     folder: Path,
     calibration: Path,
@@ -93,7 +90,7 @@ def run_campaign(
     *,
     jobs: int = 0,
     scheduler: str = "",
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> list[Entry]:
     """Correct every bag below ``folder`` into ``out``; return what became of each, by name.
 
@@ -156,9 +153,6 @@ def load_campaign(out: Path) -> list[Entry]:
 def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
     """Return the summary of a bag that is done; FileError if it is gone or damaged."""
     return read_result(out / entry.folder / SUMMARY, "summary")
-
-
-# ------------------------------------------------------------------------------ one bag
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,9 +225,6 @@ def _recorded(path: str) -> int | None:
             return bag.recorded_ns
     except FileError:
         return None
-
-
-# ---------------------------------------------------------------------------- all of them
 
 
 def _save(out: Path, entries: dict[str, Entry]) -> None:

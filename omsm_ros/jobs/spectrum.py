@@ -30,9 +30,9 @@ from omsm_ros.core.spectra.scan_signal import (
     scan_signal,
 )
 from omsm_ros.core.verification.resolved_calibration import unit_calibration
-from omsm_ros.errors import BagError, ConfigurationError
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.read_bag import Progress, no_progress, sample_period_in
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -123,7 +123,7 @@ def _names(paths: Sequence[AnyBag]) -> list[str]:
 def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> _Read:
     axes: list[AxisBlock] = []
     parts: list[SurfacePoints] = []
-    calibration = options.calibration or unit_calibration(_period_of(path))
+    calibration = options.calibration or unit_calibration(sample_period_in(path))
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
     with CorrectedScan(
         path, calibration, how, admission=options.admission, progress=progress
@@ -150,13 +150,6 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
         account=account,
         received=len(every),
     )
-
-
-def _period_of(path: AnyBag) -> float:
-    with bags.BagReader(path) as bag:
-        for _, block in bag.records(bags.DISTANCE_TOPIC):
-            return float(block.sample_period)
-    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
 
 
 def _felt(path: AnyBag) -> Felt | None:
@@ -188,9 +181,6 @@ def without_bands(scan: SpectrumOfScan) -> SurfacePoints:
             "give --stop FROM TO and a scan in one piece"
         )
     return replace(scan.points, height=scan.points.height - scan.stopped.removed)
-
-
-# ------------------------------------------------------------------------------- as JSON
 
 
 def summary_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> dict[str, Any]:

@@ -29,8 +29,7 @@ from omsm_ros.core.verification.self_calibration import (
 )
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.corrected_scan import CorrectedScan
-from omsm_ros.jobs.read_bag import Progress, no_progress
-from omsm_ros.storage import bags
+from omsm_ros.jobs.read_bag import Progress, no_progress, sample_period_in
 from omsm_ros.storage.recording.topics import AnyBag
 
 # What is to be found must not be in the points already.
@@ -40,7 +39,7 @@ _PLAIN = CorrectionOptions(lateral_lag=0.0)
 def reversal_of(
     bag_paths: Sequence[AnyBag], calibration: Calibration, progress: Progress = no_progress
 ) -> tuple[Reversal, list[Account]]:
-    """Lag of the probe against X and C from scans with opposite spindle directions.
+    """Return the lag of the probe against X and C from scans with opposite spindle directions.
 
     Also return where every sample of each scan has gone.
     """
@@ -77,7 +76,7 @@ def self_calibration_of(
     step_test: from the same machine; None takes the scans alone
     Also return where every sample of each scan has gone.
     """
-    period = _sample_period_of(bag_paths[0])
+    period = sample_period_in(bag_paths[0])
     base = step_test or unit_calibration(period, options.static_gain)
     prior = after_step_test(base) if step_test else without_step_test(options.gain_uncertainty)
     plain = replace(_PLAIN, polarity=options.polarity)
@@ -87,13 +86,6 @@ def self_calibration_of(
         return found, resolved(step_test, found), accounts
     alone = from_scans_alone(found, period, options.static_gain, options.settings)
     return found, alone, accounts
-
-
-def _sample_period_of(path: AnyBag) -> float:
-    with bags.BagReader(path) as bag:
-        for _, block in bag.records(bags.DISTANCE_TOPIC):
-            return float(block.sample_period)
-    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
 
 
 def _read_scans(

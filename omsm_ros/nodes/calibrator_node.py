@@ -105,8 +105,6 @@ class CalibratorNode(ManagedNode):
                 buffer.forget()
         self._probe = reported
 
-    # ------------------------------------------------------------------- what is in force
-
     def _claim(self, undo: ExitStack) -> None:
         """Keep a second cell from taking this one's calibrations for its own."""
         try:
@@ -143,8 +141,6 @@ class CalibratorNode(ManagedNode):
             self.get_logger().error(self._trouble)
             return self._trouble
         return f"kept as {file}"
-
-    # ------------------------------------------------------------------- identification
 
     async def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
         try:
@@ -233,8 +229,6 @@ class CalibratorNode(ManagedNode):
     @property
     def _time_lapse(self) -> object:
         return self._settings.get("time_lapse", 1.0)
-
-    # ------------------------------------------------------------------- state
 
     def report(self) -> Report:
         """Return what is held, in force, and refused."""

@@ -103,9 +103,6 @@ class DemoNode(Node):
         return answer
 
 
-# --------------------------------------------------------------------------- the measurement
-
-
 class Stage:
     """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
 
@@ -204,9 +201,6 @@ def _follow(
         return least
 
     node.wait_until(f"{total} samples at the {who}", lambda: seen() >= total, seen)
-
-
-# -------------------------------------------------------------------------------- command line
 
 
 def _arguments() -> argparse.Namespace:

@@ -82,8 +82,6 @@ class CorrectorNode(ManagedNode):
             take, push = partial(self._take, stream), partial(self._push, stream)
             listen(self, undo, kind, topic, take, after=push)
 
-    # ------------------------------------------------------------------- calibration
-
     def _put_in_force(self, calibration: Calibration, since_ns: int) -> None:
         self._use(calibration)
         self._topic.announce(calibration, since_ns)
@@ -169,8 +167,6 @@ class CorrectorNode(ManagedNode):
         response.safe = prediction.safe
         response.message = prediction.message
 
-    # ----------------------------------------------------------------------- samples
-
     def _take(self, stream: str, message: Any, info: MessageInfo) -> None:
         samples = len(message.z if stream == "axes" else message.distance)
         self._state.heard(stream, samples, message.sample_period)
@@ -219,8 +215,6 @@ class CorrectorNode(ManagedNode):
 
     def _complain(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
-
-    # -------------------------------------------------------------------- diagnostics
 
     def report(self) -> Report:
         """Return the account, and what is wrong with it now."""

@@ -67,8 +67,6 @@ class Listeners:
         self.deaf: set[str] = set()
         undo.callback(self._forget_all)
 
-    # --------------------------------------------------------------------------- account
-
     def published(self, topic: str, size: int) -> None:
         """Enter one more message of ``size`` bytes."""
         self._published[topic] += 1
@@ -111,8 +109,6 @@ class Listeners:
         size = sum(n * self._bytes[t] / max(self._published[t], 1) for t, n in waiting.items())
         most = max(waiting.values(), default=0)
         return not most or (most < _MOST_OPEN and size < _MOST_OPEN_BYTES)
-
-    # --------------------------------------------------------------------------- asking
 
     def look(self) -> None:
         """Hear what they have answered, and ask again who had not taken everything."""

@@ -138,8 +138,6 @@ class PlayerNode(ManagedNode):
         whole = begin == self._bag.start_ns and end is None
         yield from self._bag.messages(self._topics, None if whole else begin, end)
 
-    # ------------------------------------------------------------------------- playing
-
     def _tick(self) -> None:
         try:
             self._play(time.monotonic())
@@ -207,8 +205,6 @@ class PlayerNode(ManagedNode):
     def _played(self) -> str:
         return ", ".join(f"{n} {relative(topic)}" for topic, n in self._counts.items())
 
-    # ------------------------------------------------------------------------ requests
-
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> None:
         self._wanted = False
         self._playback.pause(time.monotonic())
@@ -229,8 +225,6 @@ class PlayerNode(ManagedNode):
         self._publish_next()
         self._playback.go_to(stamp, time.monotonic())
         response.success, response.message = True, f"{relative(topic)} of {stamp} ns"
-
-    # --------------------------------------------------------------------- diagnostics
 
     def report(self) -> Report:
         """Return how far it is, and what it waits for."""

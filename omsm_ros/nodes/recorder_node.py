@@ -93,8 +93,6 @@ class RecorderNode(ManagedNode):
         undo.callback(self._heard.clear)
         undo.callback(self._take_what_is_on_its_way)
 
-    # ------------------------------------------------------------------------- writing
-
     def _take(self, topic: str, cdr: bytes, info: MessageInfo) -> None:
         # A bag without an index is read in its order, which must be that of its stamps; the
         # clock of the machine may be set back.
@@ -126,8 +124,6 @@ class RecorderNode(ManagedNode):
             came = sum(take_waiting(s, partial(self._take, t)) for t, s in self._heard.items())
             in_vain = 0 if came else in_vain + 1
             time.sleep(_LOOK_S)
-
-    # --------------------------------------------------------------------- diagnostics
 
     def report(self) -> Report:
         """Return what was recorded, and lost."""

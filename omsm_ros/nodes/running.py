@@ -137,9 +137,6 @@ def _spin(node: ManagedNode, ending: _Ending) -> None:
             survive(node, err)
 
 
-# ------------------------------------------------------------------------------- doors
-
-
 def settings_of(text: str) -> dict[str, object]:
     """Return settings from a parameter that holds a JSON object, else ConfigurationError."""
     return strict_json.object_of(text, ConfigurationError, "parameter 'settings'")

@@ -124,9 +124,6 @@ def _hash_of(definition: MessageDefinition, name: str) -> str:
     return store.hash_rihs01(name)
 
 
-# ---------------------------------------------------------------------------- unpacking
-
-
 def unpacked_message(data: bytes) -> bytes:
     """Return a message that was compressed by itself; ReaderError if it is too long."""
     return _zstd(data, MAX_MESSAGE_BYTES, exactly=False)

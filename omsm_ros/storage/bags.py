@@ -76,9 +76,6 @@ _CLOCK_SET_NS = 946_684_800 * 10**9
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
 
 
-# ------------------------------------------------------------------------------ reading
-
-
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
     """What a bag holds on one topic.

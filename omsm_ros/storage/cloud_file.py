@@ -17,9 +17,6 @@ from omsm_ros.errors import FileError
 from omsm_ros.quantities import POSITION
 from omsm_ros.storage.files import open_regular, whole_file
 
-# --------------------------------------------------------------------------------- cloud
-
-
 _PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
 _PLY_HEADER_BYTES = 512
 _PLY_DTYPE = np.dtype(list(CLOUD_FIELDS))

@@ -66,9 +66,6 @@ def _ros_sequence(values: ArrayLike, dtype: DTypeLike) -> array.array[Any]:
     return result
 
 
-# ------------------------------------------------------------------ messages → records
-
-
 def stamp_of(message: Any) -> int:
     """Return the header stamp of a message [ns]."""
     stamp = message.header.stamp
@@ -159,9 +156,6 @@ def cloud_array(message: Any) -> NDArray[np.void]:
             "one that the corrector published"
         )
     return np.frombuffer(memoryview(message.data), POINT_DTYPE)
-
-
-# ------------------------------------------------------------------ records → messages
 
 
 def header(messages: Messages, stamp_ns: int, frame: str) -> Any:

@@ -19,9 +19,6 @@ FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
 """The files of a measurement."""
 
 
-# ------------------------------------------------------------------------------ reading
-
-
 def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
     """Return the text of a regular file of at most ``limit`` bytes.
 
@@ -64,9 +61,6 @@ def said(err: Exception) -> str:
     """Return what an exception says, on one line, without the path that a message names."""
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
     return " ".join(text.split())[:200] or type(err).__name__
-
-
-# ------------------------------------------------------------------------------ writing
 
 
 @contextmanager

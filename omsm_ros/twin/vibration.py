@@ -63,7 +63,7 @@ class Vibration:
     def height(
         self, middle: FloatArray, c: FloatArray, exposure_s: float, turned: FloatArray
     ) -> FloatArray:
-        """Sum of all lines [m], each the mean over an exposure.
+        """Return the sum of all lines [m], each the mean over an exposure.
 
         middle: of the exposures (n,) [s];  c: spindle angle then (n,) [rad]
         turned: by the spindle within an exposure (n,) [rad]

@@ -60,8 +60,6 @@ class LiveView:
         self._acceleration: NDArray[np.float64] = np.empty((0, 3))
         self._acceleration_period = 0.0
 
-    # ------------------------------------------------------------------------ taking in
-
     def add_points(self, cloud: NDArray[np.void]) -> None:
         """Take in points (n,) of the contract's fields."""
         if not len(cloud):
@@ -129,8 +127,6 @@ class LiveView:
         self._map.restart()
         self._series.clear()
         self._points = self._left_out = 0
-
-    # ----------------------------------------------------------------------- handing out
 
     def news(self, generation: int, version: int) -> tuple[bytes, int, int] | None:
         """Return what changed on the map since a browser's generation and version; None if nothing.

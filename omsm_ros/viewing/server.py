@@ -78,8 +78,6 @@ class LiveServer:
             self._server.shutdown()
             self._server = None
 
-    # ------------------------------------------------------------------------- requests
-
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the page, a refusal, or None where the socket may be opened."""
         place = urlsplit(request.path)

@@ -107,7 +107,7 @@ def peak_to_valley(values: FloatArray) -> FloatArray:
 
 
 def robust_peak_to_valley(values: FloatArray) -> FloatArray:
-    """Span of the middle 99.5 % of values (…, m)."""
+    """Return the span of the middle 99.5 % of values (…, m)."""
     tail = 50 * (1 - ROBUST_SHARE)
     low, high = np.percentile(values, [tail, 100 - tail], axis=-1)
     return np.asarray(high - low)

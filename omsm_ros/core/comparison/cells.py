@@ -13,7 +13,7 @@ from omsm_ros.errors import DataError
 from omsm_ros.readable import quantity
 
 # The orders that are judged; left in, they would bend within a cell.
-_TREND_DEGREE = 6
+TREND_DEGREE = 6
 # Seven hundred for each of its 28 terms.
 _TREND_POINTS = 20_000
 # Twice as large cells are a quarter as many where the points fill the surface.
@@ -43,9 +43,6 @@ class Cells:
     points: FloatArray
 
 
-# -------------------------------------------------------------------------------- trend
-
-
 class Trend:
     """A polynomial of the whole surface, by least squares."""
 
@@ -54,7 +51,7 @@ class Trend:
         x, y = points.x[some], points.y[some]
         self._middle = (float(np.mean(x)), float(np.mean(y)))
         self._scale = float(max(np.ptp(points.x), np.ptp(points.y))) / 2 or 1.0
-        degree = _TREND_DEGREE if len(x) > 10 * len(_powers(_TREND_DEGREE)) else 1
+        degree = TREND_DEGREE if len(x) > 10 * len(_powers(TREND_DEGREE)) else 1
         self._powers = _powers(degree)
         self._coefficients = np.linalg.lstsq(self._columns(x, y), points.height[some], rcond=1e-10)[
             0
@@ -84,9 +81,6 @@ class Trend:
 
 def _powers(degree: int) -> list[tuple[int, int]]:
     return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
-
-
-# -------------------------------------------------------------------------------- cells
 
 
 def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:

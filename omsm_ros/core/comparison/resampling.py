@@ -229,9 +229,6 @@ def _first_rows(
     return np.asarray(np.einsum("mki,mij->mjk", weighted, solved), np.float64)
 
 
-# --------------------------------------------------------------------------------- grid
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Resampled:
     """A map made of scattered points, and how.

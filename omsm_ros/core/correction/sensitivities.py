@@ -18,9 +18,6 @@ from omsm_ros.core.samples.blocks import FloatArray
 Parameters = Mapping[str, float]
 
 
-# ------------------------------------------------------------------------ pose of the part
-
-
 def tilt(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return tilts about y and about x; that a point also goes sideways is a hundredth."""
     return np.stack([-p.x, p.y])
@@ -40,9 +37,6 @@ def clocking(p: ScanPoints, _: Parameters) -> FloatArray:
 def expansion(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the growth of the part in all directions."""
     return p.height + p.sideways(p.x, p.y)
-
-
-# -------------------------------------------------------------------------------- machine
 
 
 def _across(p: ScanPoints, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -138,9 +132,6 @@ def backlash(p: ScanPoints, _: Parameters) -> FloatArray:
     return np.sign(p.z_rate)
 
 
-# ---------------------------------------------------------------------------------- probe
-
-
 def static_gain(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return the stretch of the distance."""
     return -p.distance / parameters["gain"]
@@ -192,9 +183,6 @@ def slope_square(p: ScanPoints, _: Parameters) -> FloatArray:
     return np.asarray(p.sideways(one, zero) ** 2 + p.sideways(zero, one) ** 2, np.float64)
 
 
-# ---------------------------------------------------------------------------------- drift
-
-
 def drift_rate(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the time."""
     return p.time
@@ -208,9 +196,6 @@ def drift_walk(p: ScanPoints, _: Parameters) -> FloatArray:
 def drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return an unknown curve over time that fades."""
     return components(fading(parameters["correlation_time"]), p.time)
-
-
-# ----------------------------------------------- sums of squares of an unknown curve's fields
 
 
 def of_a_walk(p: ScanPoints, _: Parameters) -> FloatArray:

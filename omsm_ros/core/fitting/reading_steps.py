@@ -20,7 +20,7 @@ _WHOLE = 0.05
 
 
 def reading_step(readings: FloatArray) -> float:
-    """Step of ``readings`` (k,) [m], finite; 0 where they show none."""
+    """Return the step of ``readings`` (k,) [m], finite; 0 where they show none."""
     levels = np.unique(readings)
     if len(levels) < 3 or len(readings) < _LEAST_READINGS_A_LEVEL * len(levels):
         return 0.0

@@ -169,9 +169,6 @@ def _images(
     return found
 
 
-# ------------------------------------------------------------------------------ settling
-
-
 @dataclass
 class Settled:
     """What each line is, as far as it is decided; ``also`` what else it holds."""

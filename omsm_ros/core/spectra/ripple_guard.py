@@ -220,9 +220,6 @@ def _named(done: Settled, key: Key, evidence: Evidence) -> Named:
     return replace(felt_as, evidence=(*felt_as.evidence, text), also=own.kind)
 
 
-# ------------------------------------------------------------------- by what other scans show
-
-
 def _by_claim(done: Settled, key: Key, claim: Claim) -> Named:
     scans, line = done.scans, done.evidence[key].line
     where = ", ".join(scans[own].signal.name for own, _ in claim.partners)
@@ -260,9 +257,6 @@ def _shaken(done: Settled, key: Key, claim: Claim, where: str) -> Named:
 
 def _or_image(line: Line, rate: float) -> str:
     return f"itself or the image of {needs.images(line.possible[TIME], rate)}: {needs.RATE}"
-
-
-# ------------------------------------------------------------------ by what is felt or alone
 
 
 def _feeling(scan: StudiedScan, line: Line) -> FeltLine | None:

@@ -52,7 +52,7 @@ class NormalEquations:
     surface: FloatArray
 
     def misfit(self, parameters: FloatArray) -> float:
-        """Sum of squares that ``parameters`` (p,) and the best surface leave."""
+        """Return the sum of squares that ``parameters`` (p,) and the best surface leave."""
         return float(self.square + parameters @ (self.matrix @ parameters - 2 * self.right))
 
     def surface_of(self, parameters: FloatArray) -> FloatArray:

@@ -71,8 +71,6 @@ class TextTable(ForeignTable):
             return "its first line holds numbers: name its columns by place, from [0]"
         return ""
 
-    # ------------------------------------------------------------------------- bytes → lines
-
     def _probed(self) -> str:
         """Return how the file is encoded; FileError for what is no text."""
         with open_regular(self.path, FileError, "table") as stream:
@@ -119,8 +117,6 @@ class TextTable(ForeignTable):
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
         return [cell.strip().strip('"') for cell in cells]
-
-    # ------------------------------------------------------------------------ lines → numbers
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]

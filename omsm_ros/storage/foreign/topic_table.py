@@ -160,9 +160,6 @@ def _columns(names: Sequence[str], rows: list[list[float]]) -> dict[str, FloatAr
     return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
 
-# ------------------------------------------------------------------------ fields of a message
-
-
 def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
     """Yield the ways to the numbers of a message."""
     if deep > _DEEPEST:

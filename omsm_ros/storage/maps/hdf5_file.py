@@ -69,9 +69,6 @@ def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
     return np.asarray(dataset[()])
 
 
-# ---------------------------------------------------------------------------------- .datx
-
-
 def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
     group = content[_DATX_SURFACES]
     surfaces = [group[name] for name in group if isinstance(group[name], h5py.Dataset)]
@@ -107,9 +104,6 @@ def _pixel(surface: Any, key: str, what: str) -> float:
     if (category, base) != (b"LateralCat", b"Pixels") or not numbers[1] > 0:
         raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
     return float(numbers[1])
-
-
-# ------------------------------------------------------------------------------- writing
 
 
 def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:

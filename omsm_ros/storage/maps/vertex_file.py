@@ -181,9 +181,6 @@ def _quiet(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
     return np.asarray(found)
 
 
-# ------------------------------------------------------------------------------- writing
-
-
 def write_ply(path: Path, table: NDArray[np.void]) -> None:
     """Write records (n,) of lengths in metres as binary PLY."""
     fields = [(name, table.dtype[name].str[1:]) for name in table.dtype.names or ()]

@@ -97,8 +97,6 @@ class BagWriter:
             name, MessageEncoding.CDR, self._schemas[kind], metadata
         )
 
-    # --------------------------------------------------------------------------- messages
-
     def write_raw(
         self, topic: str, stamp_ns: int, cdr: bytes | memoryview, published_ns: int | None = None
     ) -> None:
@@ -189,9 +187,6 @@ def whole_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
         raise _not_writable(path, cause) from err
     finally:
         part.unlink(missing_ok=True)
-
-
-# ---------------------------------------------------------------------------- the file
 
 
 def new_bag_file(path: Path) -> GrowingFile:
