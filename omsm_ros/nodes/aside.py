@@ -21,7 +21,7 @@ from omsm_ros.nodes.topics import REQUESTS_QOS
 
 T = TypeVar("T")
 
-# As many may wait; who comes then is answered at once, that he has to come again.
+# So many may wait; whoever comes then is told at once to ask again later.
 _MOST_WAITING = 8
 # Without work, until its memory is given back.
 _IDLE_S = 1.0
@@ -94,7 +94,7 @@ class Aside:
     def _do(self, work: Callable[[], Any], done: Future) -> None:
         try:
             done.set_result(work())
-        except Exception as err:  # told by who awaits it
+        except Exception as err:  # raised where it is awaited
             done.set_exception(err)
         # The executor looks at who waits only when something else wakes it.
         if (executor := self._node.executor) is not None:

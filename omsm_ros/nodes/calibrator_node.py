@@ -100,7 +100,9 @@ class CalibratorNode(ManagedNode):
             self.get_logger().error(f"probe settings refused: {err}", throttle_duration_sec=5.0)
             return
         if self._probe and reported != self._probe:
-            self.get_logger().warning("the probe is set otherwise: motion before is forgotten")
+            self.get_logger().warning(
+                "the probe's settings changed: the motion before is forgotten; make it anew"
+            )
             for buffer in self._buffers.values():
                 buffer.forget()
         self._probe = reported

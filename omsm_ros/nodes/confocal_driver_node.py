@@ -42,7 +42,8 @@ class ConfocalDriverNode(DriverNode):
         take = getattr(self._device, "dark_reference", None)
         if take is None:
             raise ConfigurationError(
-                f"device {self.values['device']!r} takes no dark reference by command"
+                f"device {self.values['device']!r} takes no dark reference by command; take "
+                "it as the device's manual says"
             )
         await self._aside.do(partial(self._reader.ask, take, _DARK_PATIENCE_S))
         response.success, response.message = True, "dark reference taken; identify anew"

@@ -82,7 +82,7 @@ PARAMETERS = (
         unset=_NOT_ASKED,
     ),
     Parameter(
-        "nominal", "", "SURFACE.yaml, for what errors sideways cost; '' = slopes are not known"
+        "nominal", "", "SURFACE.yaml, for what lateral errors cost; '' = slopes are not known"
     ),
     Parameter("sources_file", "", "SOURCES.yaml: what is uncertain of the machine; '' = nothing"),
     *(
