@@ -30,7 +30,7 @@ PORTION = 4096
 _EMULATORS = {"chrocodile": ChrocodileEmulator, "chrocodile_packet": ChrocodilePacketEmulator}
 
 
-# --- decoders
+# Decoders.
 
 
 def _rate(feed: Callable[[bytes], object], wire: bytes, size: int) -> float:
@@ -73,7 +73,7 @@ def _decoding() -> Iterator[Row]:
         yield at_least(f"decoding the {name}", found / 1e6, "MB/s", 10.0, plain / 1e6)
 
 
-# --- drivers
+# Drivers.
 
 
 def _serve(name: str, link: str, told: multiprocessing.Queue[str], stop: Event) -> None:

@@ -38,7 +38,7 @@ def rows(full: bool) -> Iterator[Row]:
     yield from _measured()
 
 
-# ------------------------------------------------------------------------------ mixtures
+# Mixtures.
 
 
 def _mixtures(runs: int) -> Iterator[Row]:
@@ -143,7 +143,7 @@ def _true_line(
     return min(near, key=lambda line: abs(line.amplitude - row.line.amplitude), default=None)
 
 
-# ------------------------------------------------------------------------ a measured record
+# A measured record.
 
 
 def _measured() -> Iterator[Row]:

@@ -109,7 +109,7 @@ def _own(imported):
     return parts[1] if len(parts) > 1 else ""
 
 
-# ------------------------------------------------- the rules: each yields what breaks it
+# The rules: each yields what breaks it.
 
 
 def one_way(name, tree):
@@ -263,7 +263,7 @@ def test_a_test_is_read_in_one_sitting(path):
     assert lines <= GREATEST_FILE, "split it by subject; what several share goes beside them"
 
 
-# --------------------------------------------------------------- a rule broken is a rule told
+# A rule broken is a rule told.
 
 BROKEN = [
     (one_way, "core.dynamics.new", "from omsm_ros.storage.bags import BagReader", "looks up at"),

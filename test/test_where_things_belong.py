@@ -33,7 +33,7 @@ def motion(step_test):
     return assemble([step_test.axes], [step_test.distance])
 
 
-# ----------------------------------------------------------------------- a nominal surface
+# A nominal surface.
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def test_a_nominal_surface_is_added_in_core_surface(monkeypatch, tmp_path):
         load_surface(path)
 
 
-# ------------------------------------------------------------- a residual test, a further doubt
+# A residual test, a further doubt.
 
 
 def test_a_residual_test_is_added_in_core_identification(monkeypatch, motion):
@@ -95,7 +95,7 @@ def test_what_the_data_cannot_show_is_added_in_core_identification(monkeypatch, 
     assert after.certificate["doubt_s"] == 100e-6
 
 
-# ----------------------------------------------------------------------- an uncertainty source
+# An uncertainty source.
 
 
 @pytest.mark.parametrize("source", [field.name for field in fields(ErrorSources)])
@@ -135,7 +135,7 @@ def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibrat
     assert budget[source] == pytest.approx(np.sqrt(mean_square), rel=1e-6)
 
 
-# ------------------------------------------- what needs another source: tried on a copy of it
+# What needs another source: tried on a copy of it.
 
 
 def changed_copy(folder, path, *changes):

@@ -92,7 +92,7 @@ class BlockStreamDevice(StreamDevice):
             )
         self._check_understood(silent, self._unread)
 
-    # --- what a model fills in
+    # What a model fills in.
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         """Return the fields of a frame, by the flags in the block's head."""

@@ -183,7 +183,7 @@ class Chrocodile(StreamDevice):
         """Take the dark reference: no target may be in range. It lasts about three seconds."""
         self._ask("DRK", patience=self._wanted.patience + 8.0)
 
-    # --- what a protocol fills in
+    # What a protocol fills in.
 
     def _begin(self) -> None:
         """Make the device listen; raises DeviceError."""
@@ -195,7 +195,7 @@ class Chrocodile(StreamDevice):
         """Return the answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
         raise NotImplementedError
 
-    # --- setting up
+    # Setting up.
 
     def _prepare(self) -> None:
         wanted = self._wanted
@@ -284,7 +284,7 @@ class Chrocodile(StreamDevice):
             )
         return DeviceTimeoutError(f"{self._transport.name} did not answer {name!r}; {hint}")
 
-    # --- reading
+    # Reading.
 
     def _listen_in(self, silent: float) -> None:
         """Ask a silent device whether it is still set up; a device that runs freely must talk."""

@@ -170,7 +170,7 @@ class StreamDevice:
         """Return all statistics by name, those of the protocol included."""
         return asdict(self.statistics)
 
-    # --- what a model fills in
+    # What a model fills in.
 
     def _prepare(self) -> None:
         """Set the device up; raises DeviceError."""
@@ -190,7 +190,7 @@ class StreamDevice:
     def _listen_in(self, silent: float) -> None:
         """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
 
-    # --- common
+    # Common.
 
     def _check_understood(self, silent: float, unread: int) -> None:
         """Raise NoSamplesError if bytes keep coming, but for ``silent`` [s] no sample in them.

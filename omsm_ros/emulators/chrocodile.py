@@ -91,7 +91,7 @@ class ChrocodileEmulator(Instrument):
         """Return whether samples are to be sent."""
         return self._started_stream
 
-    # --- commands
+    # Commands.
 
     def receive(self, data: bytes) -> None:
         """Take commands, in any portions."""
@@ -141,7 +141,7 @@ class ChrocodileEmulator(Instrument):
         self._values[name] = " ".join(arguments)
         return ""
 
-    # --- telegrams
+    # Telegrams.
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
         """Return the wire bytes of each sample."""

@@ -120,7 +120,7 @@ class Instrument:
         self._session = 0
         self.reset()
 
-    # --- what a model fills in
+    # What a model fills in.
 
     def reset(self) -> None:
         """Set everything as after switching on."""
@@ -146,7 +146,7 @@ class Instrument:
         """Wire bytes of each sample, or of several in their first one's place."""
         raise NotImplementedError
 
-    # --- time
+    # Time.
 
     def step(self, stop: threading.Event | None = None) -> None:
         """Do what is due now: come back, answer, measure, send."""
@@ -196,7 +196,7 @@ class Instrument:
         """End the motion."""
         self._source = None
 
-    # --- faults on command
+    # Faults on command.
 
     def unplug(self, seconds: float) -> None:
         """Take the cable out for a while; the device measures on."""
@@ -230,7 +230,7 @@ class Instrument:
         """Let the device's clock leap."""
         self._clock_offset += nanoseconds
 
-    # --- measuring and sending
+    # Measuring and sending.
 
     def _measure(self, now: float) -> list[bytes]:
         """Return the samples that have become due, packed; empty while none are to be sent."""
@@ -306,7 +306,7 @@ class Instrument:
         if wire:
             self._line.write(wire, stop)
 
-    # --- answers
+    # Answers.
 
     def say(self, wire: bytes) -> None:
         """Queue an answer, as late and as wrong as the faults have it."""

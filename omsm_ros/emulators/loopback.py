@@ -59,7 +59,7 @@ class Loopback:
         self._plugged, self._open = True, False
         self.sessions = 0
 
-    # --- the instrument's side
+    # The instrument's side.
 
     @property
     def has_reader(self) -> bool:
@@ -89,7 +89,7 @@ class Loopback:
         """What the instrument is given."""
         return _DeviceEnd(self)
 
-    # --- the driver's side
+    # The driver's side.
 
     def open(self) -> None:
         """Connect; DeviceError while unplugged."""

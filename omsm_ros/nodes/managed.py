@@ -65,7 +65,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.diagnostics = Diagnostics(self, self._report, self.hardware_id)
         self.create_service(Trigger, f"~/{topics.TAKEN}", topics.tell_taken)
 
-    # --- what a node fills in
+    # What a node fills in.
 
     def configure(self, undo: ExitStack) -> None:
         """Make what ``self.values`` describe; raises OmsmError."""
@@ -81,7 +81,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         """Return what the node's device is called; empty without one."""
         return ""
 
-    # --- for a node to use
+    # For a node to use.
 
     @property
     def active(self) -> bool:
@@ -111,7 +111,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         undo.callback(self._outputs.remove, made)
         return made
 
-    # --- transitions
+    # Transitions.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; called by ``ros2 lifecycle``, as those below."""
@@ -204,7 +204,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             "`ros2 lifecycle set` it to deactivate and cleanup, set, then configure and activate"
         )
 
-    # --- state
+    # State.
 
     def _report(self) -> Report:
         if self.stage is Stage.UNCONFIGURED:

@@ -46,7 +46,7 @@ class NodeProcesses:
             )
 
     def pid(self, node: str) -> int:
-        """Process number of a running node."""
+        """Return the process number of a running node."""
         return self._running[node].pid
 
     def check(self) -> None:

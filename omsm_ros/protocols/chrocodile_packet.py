@@ -97,7 +97,7 @@ class Data(NamedTuple):
 Message: TypeAlias = Command | DataFormat | Data
 
 
-# --- encoding ---------------------------------------------------------------------------
+# Encoding.
 
 
 def _packet(kind: int, body: bytes) -> bytes:
@@ -142,7 +142,7 @@ def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
     return _packet(DATA, head + records.tobytes())
 
 
-# --- decoding ---------------------------------------------------------------------------
+# Decoding.
 
 
 def decode_command(body: bytes) -> Command:

@@ -30,7 +30,7 @@ HEADERS = {
     "capacitive": struct.Struct("<4sIIQIHHI"),
 }
 
-# --- what a frame holds
+# What a frame holds.
 
 _VIDEO_BYTES = 1024
 # Bit of flags 1 → name and size [bytes] of what it adds to a frame, in the order of the frame.
@@ -125,7 +125,7 @@ def encode_block(form: str, block: Block, preamble: bytes = PREAMBLES[0]) -> byt
     return head + block.frames.tobytes()
 
 
-# --- decoding
+# Decoding.
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,7 +157,7 @@ def test_an_address_that_is_none_is_refused(address):
         analog_input(address, 3)
 
 
-# --------------------------------------------------------------------- NI's package, played
+# NI's package, played.
 
 
 class DaqError(Exception):

@@ -29,7 +29,7 @@ def cell(bench: Callable[..., Any]) -> Callable[..., Any]:
     return make
 
 
-# --- what arrives -----------------------------------------------------------------------
+# What arrives.
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_portions_of_the_line_change_nothing(cell: Any, portion: int) -> None:
     assert run.delivered > 200
 
 
-# --- faults, one by one -----------------------------------------------------------------
+# Faults, one by one.
 
 LOSES_NOTHING = {"duplicate", "saturate", "drop_out", "merge"}
 COUNTED = {"lose": 7, "duplicate": 12, "saturate": 5, "drop_out": 9, "noise": 200, "cut": 11}
@@ -192,7 +192,7 @@ def test_bad_answers_delay_setting_up_and_no_more(cell: Any, fault: str, value: 
     run.check()
 
 
-# --- what is refused --------------------------------------------------------------------
+# What is refused.
 
 
 def test_a_device_at_another_rate_than_it_says_is_withheld(cell: Any) -> None:
@@ -298,7 +298,7 @@ def test_senseless_settings_are_refused(arguments: dict[str, Any], named: str) -
         ChrocodileSettings(**arguments)
 
 
-# --- trigger ----------------------------------------------------------------------------
+# Trigger.
 
 
 def test_a_triggered_device_may_be_silent(cell: Any) -> None:

@@ -22,7 +22,7 @@ from omsm_ros.protocols.generic_stream import (
 
 from .scripted_stream import AT_ONCE, NEVER, Script, frames_of, run, spans
 
-# --- blocks -----------------------------------------------------------------------------
+# Blocks.
 
 
 def test_values_reach_their_fields() -> None:
@@ -91,7 +91,7 @@ def test_noise_alone_counts_as_a_pause() -> None:
     assert spans(device.poll(0.0)) == [(0, 2)]
 
 
-# --- sequence ---------------------------------------------------------------------------
+# Sequence.
 
 
 def test_a_gap_closes_the_block_and_is_counted() -> None:
@@ -188,7 +188,7 @@ def test_tracker_agrees_with_plain_counting(
     assert tracker.restarts == 0
 
 
-# --- silence ----------------------------------------------------------------------------
+# Silence.
 
 
 class Moments:

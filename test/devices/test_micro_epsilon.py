@@ -51,7 +51,7 @@ def ethernet(bench: Any, wanted: ConfocalDtSettings = THREE, **options: Any) -> 
     )
 
 
-# --- confocalDT, Ethernet ---------------------------------------------------------------
+# ConfocalDT, Ethernet.
 
 
 @pytest.mark.parametrize("portion", [1 << 20, 11])
@@ -126,7 +126,7 @@ def test_a_silent_command_port_is_named() -> None:
         run.device.open()
 
 
-# --- confocalDT, RS-422 -----------------------------------------------------------------
+# ConfocalDT, RS-422.
 
 
 @pytest.mark.parametrize("values", [("distance",), ("distance", "intensity", "counter")])
@@ -178,7 +178,7 @@ def test_a_wrong_baud_rate_is_no_sample_and_is_told(bench: Any) -> None:
     assert "baud rate" in run.troubles[0]
 
 
-# --- capaNCDT ---------------------------------------------------------------------------
+# CapaNCDT.
 
 
 def test_a_reference_is_read_to_its_24_bits(bench: Any) -> None:

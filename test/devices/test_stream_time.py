@@ -16,7 +16,7 @@ from omsm_ros.protocols.generic_stream import (
 
 from .scripted_stream import MS, NEVER, Script, assert_consistent, frames_of, run, spans
 
-# --- values that need memory ------------------------------------------------------------
+# Values that need memory.
 
 
 def test_a_wrapping_encoder_is_unwrapped_across_blocks_and_gaps() -> None:
@@ -45,7 +45,7 @@ def test_unknown_verdicts_are_counted_and_lost() -> None:
     assert device.unknown_status == 2
 
 
-# --- time -------------------------------------------------------------------------------
+# Time.
 
 
 def test_stamps_are_of_the_first_sample_on_the_host_clock() -> None:
@@ -88,7 +88,7 @@ def test_a_wrong_nominal_period_is_noticed(deviation: float, warnings: int) -> N
     assert device.statistics.period_deviation == pytest.approx(deviation, abs=1e-8)
 
 
-# --- connection -------------------------------------------------------------------------
+# Connection.
 
 
 def test_the_constructor_touches_nothing() -> None:

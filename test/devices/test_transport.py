@@ -54,7 +54,7 @@ def read_all(transport: Transport, count: int) -> bytes:
     return data
 
 
-# --- serial -----------------------------------------------------------------------------
+# Serial.
 
 
 def test_every_byte_value_passes_a_serial_port(
@@ -118,7 +118,7 @@ def test_serial_port_opens_again(
         serial_transport.close()
 
 
-# --- TCP --------------------------------------------------------------------------------
+# TCP.
 
 
 def test_every_byte_value_passes_tcp(server: socket.socket, tcp_transport: TcpTransport) -> None:
@@ -165,7 +165,7 @@ def test_nobody_listening_is_named() -> None:
         TcpTransport("127.0.0.1", port).open()
 
 
-# --- both -------------------------------------------------------------------------------
+# Both.
 
 
 @pytest.mark.parametrize("address", ["/dev/ttyUSB7", "tcp://device.invalid:7890"])

@@ -68,7 +68,7 @@ def assert_reproduced(blocks: list[BlockPair], recording: Recording, offset: int
         )
 
 
-# --- end to end -------------------------------------------------------------------------
+# End to end.
 
 
 def test_every_sample_arrives_as_the_twin_made_it(

@@ -19,7 +19,7 @@ from omsm_ros.twin.cell import Recording
 
 from .playing import EVERY_FAULT, Sink
 
-# --- pacing and the device's own state --------------------------------------------------
+# Pacing and the device's own state.
 
 
 @pytest.mark.parametrize("time_lapse", [0.5, 1.0, 20.0, 40.0, 5000.0])
@@ -99,7 +99,7 @@ def test_a_frame_cut_off_spoils_the_next_only_if_somebody_listens(
     assert (second.intact, second.spoilt) == ((count - 1, 1) if has_reader else (count, 0))
 
 
-# --- faults -----------------------------------------------------------------------------
+# Faults.
 
 
 @given(

@@ -39,7 +39,7 @@ def through_arguments(place: Path, blocks: Any) -> Cases:
     return arguments().map(lambda case: lambda: case)
 
 
-# ------------------------------------------------------------------- calibrations, models
+# Calibrations, models.
 
 
 def through_calibrations(place: Path, blocks: Any) -> Cases:
@@ -76,7 +76,7 @@ def through_models(place: Path, blocks: Any) -> Cases:
     return _with([(*words, "--out", "run.csv")], _named("bad.json", texts))
 
 
-# --------------------------------------------------------------- descriptions and settings
+# Descriptions and settings.
 
 _DESCRIBED: tuple[tuple[tuple[dict[str, Any], ...], list[tuple[str, ...]]], ...] = (
     (
@@ -121,7 +121,7 @@ def through_settings(place: Path, blocks: Any) -> Cases:
     return SETTINGS.map(lambda text: lambda: Case((*words, "--settings", text, "--json")))
 
 
-# -------------------------------------------------------------------------- tables, maps
+# Tables, maps.
 
 
 def through_csv(place: Path, blocks: Any) -> Cases:
@@ -200,7 +200,7 @@ def through_catalogues(place: Path, blocks: Any) -> Cases:
     return _with(commands, _named("bad.sqlite", inputs.damaged(good)))
 
 
-# ---------------------------------------------------------------------------------- bags
+# Bags.
 
 _ON_BAGS = [
     ("inspect", "{}"),

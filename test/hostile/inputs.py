@@ -53,7 +53,7 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
     return bytes(content)
 
 
-# -------------------------------------------------------------------------- calibrations
+# Calibrations.
 
 
 @st.composite
@@ -108,7 +108,7 @@ def _change(draw: st.DrawFn, content: dict[str, Any]) -> None:
         content[name] = draw(st.one_of(NUMBERS, VALUES))
 
 
-# --------------------------------------------------------------------------- YAML and CSV
+# YAML and CSV.
 
 _YAML_PARTS = st.sampled_from([
     "shape: sphere", "radius: 0.1", "radius: 1e300", "radius: .nan", "radius: !!float 1",

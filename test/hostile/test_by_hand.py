@@ -47,7 +47,7 @@ def refused(place: Path, words: tuple[str, ...], name: str, raw: bytes) -> str:
     return answer.err
 
 
-# ------------------------------------------------------------------------------ archives
+# Archives.
 
 
 def x3p(place: Path, change: tuple[str, str] = ("", ""), more: dict[str, bytes] | None = None):
@@ -97,7 +97,7 @@ def test_an_archive_that_is_cut_forged_or_a_bomb_is_refused(place):
     assert "thin it" in refused(place, EXPORT, "bad.x3p", bomb)
 
 
-# -------------------------------------------------------------------------- clouds, maps
+# Clouds, maps.
 
 _ASCII = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n1 2 3\n"
 _XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -145,7 +145,7 @@ def test_datasets_that_promise_what_memory_cannot_hold_are_refused(place, count,
     refused(place, EXPORT, "a.h5", (place / "a.h5").read_bytes())
 
 
-# -------------------------------------------------------------------------------- tables
+# Tables.
 
 
 def test_an_array_without_end_is_refused(place):
@@ -168,7 +168,7 @@ def test_a_line_of_megabytes_is_quoted_shortly(place):
     assert len(refused(place, IMPORT, "a.csv", b"1 " * 2_000_000)) < 700
 
 
-# -------------------------------------------------------------------------- descriptions
+# Descriptions.
 
 
 def nested(times: int) -> dict[str, Any]:
@@ -211,7 +211,7 @@ def test_a_spindle_that_stands_makes_no_scan(place, speed):
     assert "spindle_speed" in told
 
 
-# ------------------------------------------------------------------------ no files at all
+# No files at all.
 
 
 @pytest.mark.timeout(20)

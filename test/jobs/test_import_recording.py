@@ -149,7 +149,7 @@ def test_missing_triggers_stay_a_gap_and_are_counted(tmp_path, steps):
     assert [b.first_sample for b in blocks[bags.AXES_TOPIC]] == [0, 340]
 
 
-# ------------------------------------------------------------------------ time as the counter
+# Time as the counter.
 
 TIMED = """
 columns:
@@ -196,7 +196,7 @@ def test_a_stated_period_that_time_contradicts_is_refused(tmp_path):
         imported(tmp_path, TIMED + 'delimiter: ";"\nsample_period: 0.002\n', "a.csv")
 
 
-# -------------------------------------------------------------------------- what logs hold
+# What logs hold.
 
 PROBE = "sample_period: 0.001\ncolumns:\n  distance: {name: d, unit: um}\n"
 
@@ -267,7 +267,7 @@ def test_a_table_longer_than_a_piece(tmp_path):
     assert values == pytest.approx(np.arange(rows) % 50)
 
 
-# ------------------------------------------------------------------------------ other files
+# Other files.
 
 
 def test_matlab_and_numpy_tables_by_index(tmp_path):
@@ -309,7 +309,7 @@ def test_a_pickle_is_not_opened(tmp_path):
         imported(tmp_path, PROBE, "a.npy")
 
 
-# -------------------------------------------------------------------------------- the map
+# The map.
 
 
 @pytest.mark.parametrize(

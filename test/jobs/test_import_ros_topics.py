@@ -116,7 +116,7 @@ def ranges(count, period=1e-3, late=0.0, **limits):
         yield "/probe", "sensor_msgs/msg/Range", at_ns, range_message(at_ns, value, **limits)
 
 
-# --------------------------------------------------------------------------------------- ROS 2
+# ROS 2.
 
 
 def test_joints_and_a_range_become_axes_and_distance(importer):

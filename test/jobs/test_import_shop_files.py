@@ -33,7 +33,7 @@ def refusal(read, *given):
     return said
 
 
-# --------------------------------------------------------------------------------- read rightly
+# Read rightly.
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_seconds_since_1970_set_the_clock(read):
     assert abs(read.importer.blocks()[0].stamp_ns - 1763200000_250_000_000) < 1000
 
 
-# ------------------------------------------------------------------------ refused in one line
+# Refused in one line.
 
 
 @pytest.mark.parametrize(

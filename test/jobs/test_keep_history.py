@@ -131,7 +131,7 @@ def test_two_writers_at_once_lose_nothing(tmp_path, address):
     assert len({row["folder"] for row in machine.measurements}) == 20
 
 
-# --------------------------------------------------------------- databases that fail
+# Databases that fail.
 
 
 def test_a_correction_does_not_fail_with_its_catalogue(

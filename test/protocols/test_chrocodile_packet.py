@@ -46,7 +46,7 @@ def counters(found: list[Message]) -> list[int]:
     return [int(c) for m in found if isinstance(m, Data) for c in m.records["83"]]
 
 
-# --- by hand ----------------------------------------------------------------------------
+# By hand.
 
 
 def test_a_command_by_hand() -> None:
@@ -98,7 +98,7 @@ def test_more_than_a_packet_holds_is_refused() -> None:
         data(0, 1000)
 
 
-# --- every split, every damage ----------------------------------------------------------
+# Every split, every damage.
 
 
 @given(values, st.integers(0, 2**16 - 1), st.data())

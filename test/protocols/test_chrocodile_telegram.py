@@ -47,7 +47,7 @@ def everything(made: BinaryDecoder | LineDecoder, *portions: bytes) -> Records:
     return np.frombuffer(b"".join(p.tobytes() for p in parts), parts[0].dtype)
 
 
-# --- the wire, by hand ------------------------------------------------------------------
+# The wire, by hand.
 
 
 def test_a_telegram_by_hand_mixes_its_byte_orders() -> None:
@@ -74,7 +74,7 @@ def test_a_line_by_hand() -> None:
     assert layout.lines(made) == [b" 7 12.2500 -3\r\n", b" 8 -0.5000 0\r\n"]
 
 
-# --- what the device describes ----------------------------------------------------------
+# What the device describes.
 
 
 @given(selections)
@@ -120,7 +120,7 @@ def test_a_signal_not_in_the_table_needs_a_description() -> None:
         Layout.of((83,), b"\xff")
 
 
-# --- every split, every place -----------------------------------------------------------
+# Every split, every place.
 
 
 @given(selections, st.integers(1, 6), st.data())
@@ -161,7 +161,7 @@ def test_joined_in_the_middle_with_syncs_in_the_data(cut: int, seed: int) -> Non
     assert len(found) >= 12 - cut // 28 - 2
 
 
-# --- damage -----------------------------------------------------------------------------
+# Damage.
 
 
 @given(st.binary(max_size=300), st.integers(0, 5))
@@ -206,7 +206,7 @@ def test_a_telegram_cut_off_is_never_completed_by_silence() -> None:
     assert len(made.settle()) == 0
 
 
-# --- lines ------------------------------------------------------------------------------
+# Lines.
 
 
 @given(selections, st.integers(1, 6), st.data())

@@ -47,7 +47,7 @@ def cobs_by_definition(data: bytes) -> bytes:
     return b"".join(bytes([len(run) + 1]) + run for run in data.split(b"\0"))
 
 
-# --- wire format ------------------------------------------------------------------------
+# Wire format.
 
 
 def test_wire_format_is_the_documented_table() -> None:
@@ -93,7 +93,7 @@ def test_byte_by_byte(frames: FrameArray) -> None:
     assert_same(np.concatenate(parts), frames)
 
 
-# --- damage -----------------------------------------------------------------------------
+# Damage.
 
 
 @given(st.binary(max_size=400), any_frames)
@@ -201,7 +201,7 @@ def test_a_frame_of_another_size_with_a_good_crc_is_refused() -> None:
     assert decoder.statistics.bad_length == 1
 
 
-# --- scaling ----------------------------------------------------------------------------
+# Scaling.
 
 
 @given(

@@ -51,7 +51,7 @@ def counters(found: list[Block]) -> list[int]:
     return [int(c) for b in found for c in b.frames.reshape(-1).view(DTYPE)["counter"]]
 
 
-# --- blocks, by hand --------------------------------------------------------------------
+# Blocks, by hand.
 
 
 @pytest.mark.parametrize("preamble", [b"MEAS", b"SAEM"])
@@ -115,7 +115,7 @@ def test_flags_decide_on_the_frame() -> None:
         channel_dtype(0)
 
 
-# --- blocks, split and damaged ----------------------------------------------------------
+# Blocks, split and damaged.
 
 
 @given(st.lists(st.integers(1, 20), min_size=1, max_size=6), st.data())
@@ -167,7 +167,7 @@ def test_noise_and_mutations_raise_nothing(portions: list[bytes], place: int, va
     assert found.bytes_pending <= (1 << 20) + 300
 
 
-# --- three bytes a value ----------------------------------------------------------------
+# Three bytes a value.
 
 
 def test_a_value_by_hand() -> None:

@@ -93,7 +93,7 @@ class Hour:
             rclpy.spin_once(self.cell.operator, timeout_sec=0.1)
             self.cell.processes.check()
 
-    # ------------------------------------------------------------------------------ faults
+    # Faults.
 
     def network_gone(self):
         self.wire.vanish()

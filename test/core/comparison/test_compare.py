@@ -124,7 +124,7 @@ def test_a_scratch_that_no_zernike_term_sees_is_found():
     assert found.agreement.at == pytest.approx((1e-3, -2e-3), abs=0.2e-3)
 
 
-# ------------------------------------------------------------------------- errors in fields
+# Errors in fields.
 
 
 def turned_field(scan_of, size):
@@ -160,7 +160,7 @@ def test_an_error_that_both_share_is_subtracted():
     assert spread["", ""] == spread["one", "two"]
 
 
-# ------------------------------------------------------------------------------ matching
+# Matching.
 
 
 def test_piston_tip_tilt_and_power_are_taken_off_and_told():

@@ -175,7 +175,7 @@ def test_sizes_alone_are_declared() -> None:
         declared_sources({"spindle_axial": 1e-9})
 
 
-# -------------------------------------------------------------- points that stand for a scan
+# Points that stand for a scan.
 
 
 def corrected(

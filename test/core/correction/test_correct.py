@@ -30,7 +30,7 @@ from .corrected_runs import (
     shifted,
 )
 
-# --- against the truth of the twin ---------------------------------------------------------
+# Against the truth of the twin.
 
 
 def test_the_probes_true_motion_is_found(quiet_scan: Recording) -> None:
@@ -98,7 +98,7 @@ def test_geometry_moves_the_points(quiet_scan: Recording) -> None:
     assert np.array_equal(moved.height, usual.height)
 
 
-# --- the same bits, live and offline --------------------------------------------------------
+# The same bits, live and offline.
 
 
 @settings(max_examples=25, deadline=None)
@@ -188,7 +188,7 @@ def test_a_pitch_costs_height_over_the_abbe_arm(scan: Recording) -> None:
     assert stated(pitch=2e-6, abbe_arm=0.05) == pytest.approx(np.hypot(plain, 100e-9), rel=1e-6)
 
 
-# --- uncertainty ------------------------------------------------------------------------------
+# Uncertainty.
 
 
 def test_the_budget_is_the_uncertainty_of_the_points(scan: Recording) -> None:
@@ -209,7 +209,7 @@ def test_stated_noise_is_the_scatter_of_the_heights(scan: Recording) -> None:
     assert np.std(error / points.uncertainty) == pytest.approx(1.0, abs=0.02)
 
 
-# --- latency ------------------------------------------------------------------------------------
+# Latency.
 
 
 def test_latency_is_assumed_only_where_it_is_known() -> None:

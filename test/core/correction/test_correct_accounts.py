@@ -26,7 +26,7 @@ from .corrected_runs import (
     shifted,
 )
 
-# --- every sample is accounted for ----------------------------------------------------------
+# Every sample is accounted for.
 
 
 def test_settling_is_counted_in_both_streams(scan: Recording) -> None:

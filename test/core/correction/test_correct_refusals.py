@@ -20,7 +20,7 @@ from .corrected_runs import (
     run,
 )
 
-# --- refusals --------------------------------------------------------------------------------
+# Refusals.
 
 
 def other_rate(block: AxisBlock | DistanceBlock, period: float) -> AxisBlock | DistanceBlock:

@@ -91,7 +91,7 @@ def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
         bands_of(cells, 8e-3, 8e-3)
 
 
-# ---------------------------------------------------------------------- spectral densities
+# Spectral densities.
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])

@@ -130,7 +130,7 @@ def without(numbers: np.ndarray, first: int, samples: int) -> np.ndarray:
     return np.delete(numbers, np.arange(first, first + samples))
 
 
-# --- what slips -----------------------------------------------------------------------------
+# What slips.
 
 
 @pytest.mark.parametrize("missed", [1, 10, 100])
@@ -208,7 +208,7 @@ def test_it_heals_when_the_counts_agree_again() -> None:
     assert 1000 < done.slipped < 2600
 
 
-# --- what does not --------------------------------------------------------------------------
+# What does not.
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -311,7 +311,7 @@ def test_a_link_known_to_be_late_is_tolerated() -> None:
     assert done.seen_from == 17
 
 
-# --- whatever the order ---------------------------------------------------------------------
+# Whatever the order.
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -107,7 +107,7 @@ def test_beyond_its_end_a_surface_has_no_height():
     assert np.isfinite(Asphere(0.1, -1.0).height(far, 0 * far))
 
 
-# --------------------------------------------------------------------- sections and poses
+# Sections and poses.
 
 
 def test_a_section_of_a_paraboloid_is_the_closed_form():
@@ -170,7 +170,7 @@ def test_where_a_turned_surface_has_no_height_it_says_so():
     assert np.isnan(z[1])
 
 
-# ------------------------------------------------------------------------- Forbes' series
+# Forbes' series.
 
 
 def test_the_first_polynomials_of_forbes_are_those_of_his_paper():

@@ -14,7 +14,7 @@ from omsm_ros.storage.maps.read_map import read_points
 
 from .surfaces import by_place, grid
 
-# ------------------------------------------------------------------------------ MetroPro
+# MetroPro.
 
 WAVELENGTH, SCALE, PIXEL = 632.8e-9, 0.5, 85e-6
 NO_DATUM = 2147483640
@@ -94,7 +94,7 @@ def test_a_metropro_file_that_cannot_be_scaled_is_refused(tmp_path, raw, told):
         read_points(path)
 
 
-# ---------------------------------------------------------------------------------- datx
+# Datx.
 
 
 def datx(path, *, unit="NanoMeters", height=None, dx=1e-4, dy=2e-4, no_data=1e300):
@@ -161,7 +161,7 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
         read_points(path)
 
 
-# ----------------------------------------------------------------------------------- x3p
+# X3p.
 
 
 def test_an_x3p_of_another_program(tmp_path):
@@ -215,7 +215,7 @@ def test_an_x3p_bomb_and_an_x3p_of_nothing_are_refused(tmp_path, monkeypatch):
             read_points(tmp_path / name)
 
 
-# --------------------------------------------------------------------------- PLY and PCD
+# PLY and PCD.
 
 PLY = """ply
 format {form} 1.0

@@ -139,7 +139,7 @@ def test_name_and_unit(text, name, unit):
     assert name_and_unit(text) == (name, unit)
 
 
-# ------------------------------------------------------------------------------ grid sag
+# Grid sag.
 
 
 def test_a_grid_sag_begins_at_the_upper_left(tmp_path):

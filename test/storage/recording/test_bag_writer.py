@@ -193,7 +193,7 @@ def test_a_whole_bag_appears_when_all_went_well_or_not_at_all(tmp_path, axes):
     assert list(tmp_path.iterdir()) == [path]
 
 
-# --------------------------------------------------------------------------- no more room
+# No more room.
 
 
 def test_a_limit_of_size_ends_with_a_readable_bag_and_one_line(tmp_path, axes):
