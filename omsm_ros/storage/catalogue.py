@@ -107,11 +107,7 @@ class Catalogue:
     def _translated(self) -> Iterator[None]:
         try:
             yield
-        except self._sql.exc.NoSuchModuleError as err:
-            raise ConfigurationError(
-                f"catalogue: {said(err)}; pip install psycopg[binary]"
-            ) from err
-        except ImportError as err:
+        except (ImportError, self._sql.exc.NoSuchModuleError) as err:
             raise ConfigurationError(
                 f"catalogue: {said(err)}; pip install psycopg[binary]"
             ) from err

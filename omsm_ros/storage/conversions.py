@@ -219,7 +219,7 @@ def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) 
 
 
 def _all_finite(packed: NDArray[np.void]) -> bool:
-    # A device that tells no intensity leaves NaN there, and PCL must know.
+    # A device that reports no intensity leaves NaN there, and PCL must know.
     return all(bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind)
 
 

@@ -1,4 +1,4 @@
-"""``GEOMETRY.yaml``, ``LIMITS.yaml``: the probe, the machine."""
+"""``GEOMETRY.yaml``, ``LIMITS.yaml``, ``PITCH.csv``: how the probe sits, what the machine can do."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _T = TypeVar("_T")
 
 def load_geometry(path: Path | str) -> Geometry:
     """Read ``GEOMETRY.yaml``: where the probe sits and looks, in metres and slopes."""
-    values = _read_mapping(path, "geometry", FileError)
-    return _made(Geometry, values, FileError, f"geometry {str(path)!r}")
+    values = _read_mapping(path, "geometry")
+    return _made(Geometry, values, f"geometry {str(path)!r}")
 
 
 def load_limits(path: Path | str) -> MachineLimits:
     """Read ``LIMITS.yaml``: what servo, probe, spindle and axes can do, units in the names."""
-    values = _read_mapping(path, "limits", FileError)
-    return _made(MachineLimits, values, FileError, f"limits {str(path)!r}")
+    values = _read_mapping(path, "limits")
+    return _made(MachineLimits, values, f"limits {str(path)!r}")
 
 
 def load_pitch(path: Path | str) -> PitchCurve:
@@ -53,19 +53,17 @@ def save_geometry(path: Path | str, geometry: Geometry) -> None:
     save_text(path, yaml.safe_dump(asdict(geometry), sort_keys=False))
 
 
-def _made(
-    kind: Callable[..., _T], values: Mapping[str, Any], error: type[FileError], what: str
-) -> _T:
+def _made(kind: Callable[..., _T], values: Mapping[str, Any], what: str) -> _T:
     """Return a record of numbers made of ``values``, which must have its fields' names."""
     parameters = fields(kind)  # type: ignore[arg-type]
     required = [field.name for field in parameters if field.default is MISSING]
-    check_form(values, form({p.name: NUMBER for p in parameters}, required), error, what)
+    check_form(values, form({p.name: NUMBER for p in parameters}, required), FileError, what)
     try:
         return kind(**values)
     except ConfigurationError as err:
-        raise error(f"{what}: {err}") from err
+        raise FileError(f"{what}: {err}") from err
 
 
-def _read_mapping(path: Path | str, what: str, error: type[FileError]) -> dict[str, Any]:
-    text = read_text(path, MAX_YAML_BYTES, error, what)
-    return strict_yaml.mapping_of(text, error, f"{what} {str(path)!r}")
+def _read_mapping(path: Path | str, what: str) -> dict[str, Any]:
+    text = read_text(path, MAX_YAML_BYTES, FileError, what)
+    return strict_yaml.mapping_of(text, FileError, f"{what} {str(path)!r}")

@@ -26,8 +26,8 @@ def value_of(text: str, error: type[OmsmError], what: str) -> Any:
         value = json.loads(
             text,
             parse_constant=_no_constant,
-            parse_float=_finite,
-            parse_int=_bounded,
+            parse_float=finite_float,
+            parse_int=bounded_integer,
             object_pairs_hook=_names_once,
         )
         _check_nest(value, MAX_DEPTH)
@@ -64,13 +64,15 @@ def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def _finite(text: str) -> float:
+def finite_float(text: str) -> float:
+    """Return the number that ``text`` writes; ValueError for one beyond the range of a float."""
     if not math.isfinite(value := float(text)):
         raise ValueError(f"{shown(text)} is beyond the range of a float")
     return value
 
 
-def _bounded(text: str) -> int:
+def bounded_integer(text: str) -> int:
+    """Return the integer that ``text`` writes; ValueError for one of more than 64 bits."""
     if len(text) > 20 or (value := int(text)) not in _INTEGERS:
         raise ValueError(f"the integer {shown(text)} has more than 64 bits")
     return value

@@ -6,17 +6,18 @@ that unfold to gigabytes, tags that name Python objects, dates, and ``no`` as a 
 
 from __future__ import annotations
 
-import math
 import re
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
 
 import yaml
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.quantities import shown
+from omsm_ros.storage.strict_json import bounded_integer, finite_float
 
 MAX_DEPTH = 8
-_INTEGERS = range(-(2**63), 2**64)
+_Number = TypeVar("_Number")
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -48,18 +49,20 @@ class _PlainLoader(yaml.SafeLoader):
             met.add(key.value)
         return super().construct_mapping(node, deep)
 
-    def _refuse(self, where: yaml.Event | yaml.Node, why: str) -> None:
+    def _refuse(self, where: yaml.Event | yaml.Node, why: str) -> NoReturn:
         raise yaml.constructor.ConstructorError(None, None, why, where.start_mark)
 
     def construct_bounded_int(self, node: yaml.ScalarNode) -> int:
-        if len(node.value) > 20 or (value := int(node.value)) not in _INTEGERS:
-            self._refuse(node, f"the integer {shown(node.value)} has more than 64 bits")
-        return value
+        return self._number(node, bounded_integer)
 
     def construct_finite_float(self, node: yaml.ScalarNode) -> float:
-        if not math.isfinite(value := float(node.value)):
-            self._refuse(node, f"{shown(node.value)} is beyond the range of a float")
-        return value
+        return self._number(node, finite_float)
+
+    def _number(self, node: yaml.ScalarNode, read: Callable[[str], _Number]) -> _Number:
+        try:
+            return read(node.value)
+        except ValueError as err:
+            self._refuse(node, str(err))
 
 
 def _tag(kind: str) -> str:
