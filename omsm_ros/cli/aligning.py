@@ -74,11 +74,4 @@ def _show_align(facts: Facts) -> None:
     table([*rows, ("written to", facts["file"])])
 
 
-COMMANDS = (
-    Command(
-        "align",
-        _declare_align,
-        _align,
-        _show_align,
-    ),
-)
+COMMANDS = (Command("align", _declare_align, _align, _show_align),)

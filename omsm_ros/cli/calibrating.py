@@ -33,8 +33,6 @@ from omsm_ros.storage.calibration_file import load_calibration, save_calibration
 from omsm_ros.storage.files import save_text
 from omsm_ros.units import DEGREE_RAD
 
-# A second height that is no simple part of the first: 3 µm beside 9.8 µm.
-
 
 def _declare_verify(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
@@ -240,23 +238,7 @@ def _show_calset(facts: Facts) -> None:
 
 COMMANDS = (
     Command("plan", _declare_plan, _plan, _show_plan),
-    Command(
-        "verify",
-        _declare_verify,
-        _verify,
-        _show_verify,
-    ),
-    Command(
-        "compare",
-        _declare_compare,
-        _compare,
-        lambda facts: print(facts["text"]),
-    ),
-    Command(
-        "calset",
-        _declare_calset,
-        _calset,
-        _show_calset,
-        rejected,
-    ),
+    Command("verify", _declare_verify, _verify, _show_verify),
+    Command("compare", _declare_compare, _compare, lambda facts: print(facts["text"])),
+    Command("calset", _declare_calset, _calset, _show_calset, rejected),
 )

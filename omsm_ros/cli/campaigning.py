@@ -93,12 +93,4 @@ def _undone(facts: Facts) -> str:
     )
 
 
-COMMANDS = [
-    Command(
-        "batch",
-        _declare_batch,
-        _batch,
-        _show_batch,
-        _undone,
-    ),
-]
+COMMANDS = (Command("batch", _declare_batch, _batch, _show_batch, _undone),)

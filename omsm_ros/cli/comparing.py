@@ -127,11 +127,4 @@ def _length(value: float) -> str:
     return quantity(value, "m", 4)
 
 
-COMMANDS = (
-    Command(
-        "difference",
-        _declare_difference,
-        _difference,
-        _show_difference,
-    ),
-)
+COMMANDS = (Command("difference", _declare_difference, _difference, _show_difference),)

@@ -51,11 +51,4 @@ def _show_completion(facts: Facts) -> None:
     print(facts["script"])
 
 
-COMMANDS = [
-    Command(
-        "completion",
-        _declare_completion,
-        _completion,
-        _show_completion,
-    ),
-]
+COMMANDS = (Command("completion", _declare_completion, _completion, _show_completion),)

@@ -62,11 +62,4 @@ def _show_export(facts: Facts) -> None:
     table([*rows, ("written", facts["file"])])
 
 
-COMMANDS = (
-    Command(
-        "export",
-        _declare_export,
-        _export,
-        _show_export,
-    ),
-)
+COMMANDS = (Command("export", _declare_export, _export, _show_export),)

@@ -162,22 +162,7 @@ def _show_surface(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command(
-        "form",
-        _declare_form,
-        _form,
-        _show_form,
-    ),
-    Command(
-        "compensate",
-        _declare_compensate,
-        _compensate,
-        _show_compensate,
-    ),
-    Command(
-        "surface",
-        _declare_surface,
-        _surface,
-        _show_surface,
-    ),
+    Command("form", _declare_form, _form, _show_form),
+    Command("compensate", _declare_compensate, _compensate, _show_compensate),
+    Command("surface", _declare_surface, _surface, _show_surface),
 )

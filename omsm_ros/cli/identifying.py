@@ -253,17 +253,6 @@ def _show_validate(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command(
-        "identify",
-        _declare,
-        _identify,
-        _show,
-        rejected,
-    ),
-    Command(
-        "validate",
-        _declare_validate,
-        _validate,
-        _show_validate,
-    ),
+    Command("identify", _declare, _identify, _show, rejected),
+    Command("validate", _declare_validate, _validate, _show_validate),
 )

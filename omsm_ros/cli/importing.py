@@ -44,11 +44,4 @@ def _show_import(facts: Facts) -> None:
     print(f"written: {facts['bag']}; look at it with 'omsm inspect'")
 
 
-COMMANDS = [
-    Command(
-        "import",
-        _declare_import,
-        _import,
-        _show_import,
-    ),
-]
+COMMANDS = (Command("import", _declare_import, _import, _show_import),)

@@ -243,16 +243,6 @@ def _times(factor: float) -> str:
 
 
 COMMANDS = (
-    Command(
-        "predict",
-        _declare_predict,
-        _predict,
-        _show_predict,
-    ),
-    Command(
-        "correct",
-        _declare_correct,
-        _correct,
-        _show_correct,
-    ),
+    Command("predict", _declare_predict, _predict, _show_predict),
+    Command("correct", _declare_correct, _correct, _show_correct),
 )

@@ -95,11 +95,4 @@ def _drift(found: dict[str, float] | None, unit: str) -> str:
     return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
 
 
-COMMANDS = [
-    Command(
-        "history",
-        _declare_history,
-        _history,
-        _show_history,
-    ),
-]
+COMMANDS = (Command("history", _declare_history, _history, _show_history),)

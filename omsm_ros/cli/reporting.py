@@ -29,11 +29,4 @@ def _show_report(facts: Facts) -> None:
     print(f"written: {facts['report']}")
 
 
-COMMANDS = [
-    Command(
-        "report",
-        _declare_report,
-        _report,
-        _show_report,
-    ),
-]
+COMMANDS = (Command("report", _declare_report, _report, _show_report),)

@@ -165,7 +165,7 @@ def _reversal(args: argparse.Namespace) -> Facts:
 _MEANINGS = {
     True: "the probe is late: X and C must be delayed too",
     False: "the lag is mechanical, in Z only",
-    None: "neither none nor all of the lag of Z",
+    None: "not decided: it is neither zero nor the lag of Z",
 }
 
 
@@ -211,24 +211,7 @@ def _show_latency(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command(
-        "selfcal",
-        _declare_selfcal,
-        _selfcal,
-        _show_selfcal,
-        rejected,
-    ),
-    Command(
-        "reversal",
-        _declare_reversal,
-        _reversal,
-        _show_reversal,
-    ),
-    Command(
-        "latency",
-        _declare_latency,
-        _latency,
-        _show_latency,
-        rejected,
-    ),
+    Command("selfcal", _declare_selfcal, _selfcal, _show_selfcal, rejected),
+    Command("reversal", _declare_reversal, _reversal, _show_reversal),
+    Command("latency", _declare_latency, _latency, _show_latency, rejected),
 )

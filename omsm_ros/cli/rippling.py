@@ -78,11 +78,4 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
     return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
 
 
-COMMANDS = (
-    Command(
-        "spectrum",
-        _declare_spectrum,
-        _spectrum,
-        _show_spectrum,
-    ),
-)
+COMMANDS = (Command("spectrum", _declare_spectrum, _spectrum, _show_spectrum),)

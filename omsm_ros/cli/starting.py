@@ -77,18 +77,7 @@ def _show_twin(facts: Facts) -> None:
     print(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
 
 
-COMMANDS = [
-    Command(
-        "twin",
-        _declare_twin,
-        _twin,
-        _show_twin,
-    ),
-    Command(
-        "doctor",
-        _declare_doctor,
-        _doctor,
-        _show_doctor,
-        _faulty,
-    ),
-]
+COMMANDS = (
+    Command("twin", _declare_twin, _twin, _show_twin),
+    Command("doctor", _declare_doctor, _doctor, _show_doctor, _faulty),
+)

@@ -1,4 +1,4 @@
-"""``GEOMETRY.yaml``, ``LIMITS.yaml``, ``PITCH.csv``: how the probe sits, what the machine can do."""
+"""``GEOMETRY.yaml``, ``LIMITS.yaml``, ``PITCH.csv``: the probe's place, the machine's limits."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ _LEAST_RISE_SAMPLES = 10
 # which a relaxation as slow as the test itself is open by 12 ppm (10 nm of noise at 1 kHz).
 PLANNED_COUNT = 14
 PLANNED_DWELL_S = 2.0
+# A second height that is no simple part of the first: 3 µm beside 9.8 µm.
 SECOND_SHARE = 3 / 9.8
 # A quarter of an hour at 1 kHz, thirty megabytes.
 _MOST_LINES = 1_000_000
