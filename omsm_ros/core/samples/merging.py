@@ -11,10 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.units import NANOSECONDS_PER_S
 
 B = TypeVar("B", AxisBlock, DistanceBlock)
+AnyBlock = TypeVar("AnyBlock", bound=Block)
 
 MOST_TOGETHER = 500
 """Samples: longer blocks cost little less a sample; queues keep room for the messages they make."""
@@ -24,9 +25,9 @@ _STAMP_TOLERANCE_S = 1e-3
 _NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
 
 
-def uninterrupted(blocks: Sequence[B]) -> list[list[B]]:
+def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
     """Return the blocks in runs, the count of each block following on that of the one before."""
-    runs: list[list[B]] = []
+    runs: list[list[AnyBlock]] = []
     for block in blocks:
         if runs and block.first_sample == runs[-1][-1].end:
             runs[-1].append(block)

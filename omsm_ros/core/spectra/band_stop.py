@@ -35,7 +35,7 @@ class BandStopped:
 
     @property
     def rms_removed(self) -> float:
-        """[m]"""
+        """Of what was removed [m]."""
         return float(np.sqrt(np.mean(self.removed**2)))
 
 

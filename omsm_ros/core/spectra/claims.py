@@ -22,7 +22,7 @@ from omsm_ros.core.spectra.hypotheses import (
     found_at,
     hypotheses_of,
     place_in,
-    told_by,
+    shows,
 )
 from omsm_ros.core.spectra.line import Line
 from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME
@@ -98,11 +98,11 @@ def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[Tested]:
         for other, scan in enumerate(scans):
             if other == own or (hypothesis.kind == PART and not _same_part(scans[own], scan)):
                 continue
-            said = told_by(scan, hypothesis, line.amplitude)
-            if said:
+            shown = shows(scan, hypothesis, line.amplitude)
+            if shown:
                 place = place_in(scan, hypothesis)
                 present += [_key_at(other, scan, place)] if place is not None else []
-            elif said is not None:
+            elif shown is not None:
                 absent.append(other)
         yield Tested(hypothesis, tuple(present), tuple(absent))
 

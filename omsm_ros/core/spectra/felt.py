@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import SAME_PERIOD, AccelerationBlock, FloatArray
+from omsm_ros.core.samples.merging import uninterrupted
 from omsm_ros.core.spectra.lines import find_lines
 from omsm_ros.core.spectra.scan_signal import ScanSignal
 from omsm_ros.errors import DataError
@@ -61,12 +61,7 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
         raise DataError(
             f"acceleration with sample periods {sorted(periods)!r} s, expected one; record again"
         )
-    first = np.array([block.first_sample for block in blocks])
-    end = first + np.array([len(block) for block in blocks])
-    cuts = np.r_[0, np.flatnonzero(first[1:] != end[:-1]) + 1, len(blocks)]
-    lengths = [int(end[b - 1] - first[a]) for a, b in pairwise(cuts)]
-    longest = int(np.argmax(lengths))
-    run = blocks[cuts[longest] : cuts[longest + 1]]
+    run = max(uninterrupted(blocks), key=lambda run: sum(map(len, run)))
     axes = {axis: np.concatenate([getattr(b, axis) for b in run]) for axis in AXES}
     if len(axes["z"]) < _LEAST_SAMPLES:
         raise DataError(

@@ -22,7 +22,7 @@ from omsm_ros.core.spectra.scan_signal import ScanSignal
 Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
 """Columns (m, q) of what is to be fitted beside the form, at the samples (m,) asked for."""
 
-# Fewer turns do not tell what repeats with the turn.
+# Fewer turns do not show what repeats with the turn.
 LEAST_TURNS = 1.5
 # Harmonics of a turn that may be the spindle's beside the figure's.
 HIGHEST_ORDER = 12
@@ -67,7 +67,7 @@ class Order:
 
     @property
     def amplitude(self) -> float:
-        """[m]"""
+        """Half of peak to valley [m]."""
         return float(np.hypot(self.cosine, self.sine))
 
 

@@ -180,7 +180,7 @@ def by_chance(scan: StudiedScan, place: Place) -> float:
     return count * 2 * place.tolerance / band
 
 
-def told_by(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
+def shows(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
     """Return whether a line of ``amplitude`` [m] elsewhere is in ``scan``; None: undecidable."""
     place = place_in(scan, hypothesis)
     if place is None or by_chance(scan, place) > _GREATEST_CHANCE:

@@ -18,7 +18,7 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.samples.merging import uninterrupted
 from omsm_ros.errors import DataError
 
-# One turn a second at 1 kHz; with less a surface cannot be told from anything.
+# One turn a second at 1 kHz; fewer points do not determine a surface.
 _LEAST_POINTS = 1000
 # Of one scan: 72 bytes each; a portion of them at a time is made into rows of the fit.
 _MOST_POINTS = 500_000

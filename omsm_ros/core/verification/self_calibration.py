@@ -37,7 +37,7 @@ DEFAULT_HARMONICS = 12
 # A tenth of a second of arc: what the index of a good rotary encoder repeats to.
 DEFAULT_CLOCKING_RAD = 5e-7
 # A part that stays on the chuck moves by warming alone; on an off-axis paraboloid a shift and
-# a tilt together look like clocking, so what is allowed here limits what can be told.
+# a tilt together look like clocking, so what is allowed here limits what can be determined.
 DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
 # A prior as wide as this is none, yet the matrix stays regular.
 _FREE = 1e6
