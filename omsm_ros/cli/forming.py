@@ -25,7 +25,6 @@ from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import DEGREE_RAD
 
-
 _WRITTEN = (CLOUD, SYSTEMATIC, SUMMARY, DEVIATION, CURVES, FORM, REPORT)
 
 
