@@ -175,3 +175,13 @@ def test_a_wrong_time_among_samples_that_arrive_together_is_not_believed() -> No
     stamps = [clock.to_host(t) for t in (-1, newest - 2 * MS, 2**64 - 1)]
     assert all(abs(stamp - EPOCH) <= 2 * MS for stamp in stamps)
     assert clock.to_host(newest + 10 * MS) == EPOCH + 10 * MS
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_uneven_arrivals_are_no_other_rate(seed: int) -> None:
+    """A busy host, ±50 ms: in the first second no line is a tenth off."""
+    device, _, arrival = link(400, jitter=50.0, seed=seed)
+    clock = DeviceClock()
+    for sent, came in zip(device, np.maximum.accumulate(arrival), strict=True):
+        clock.observe(int(sent), int(came))
+        assert clock.drift is None or abs(clock.drift) < 0.1

@@ -89,6 +89,16 @@ def turned(wire: bytes) -> bytes:
     return wire[:28] + frames.tobytes()
 
 
+@pytest.mark.parametrize("rate", [0.5, 0.85, 2.0])
+def test_a_grossly_wrong_rate_shows_within_some_two_seconds(bench: Any, rate: float) -> None:
+    """By its arrivals, for the device tells no time."""
+    run = bench(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    run.instrument.faults.rate = rate
+    run.run(4.0)
+    assert 0 < run.delivered < 1300
+    assert f"measures at {1000 * rate:.0f}" in run.device.trouble
+
+
 NOISE = np.random.default_rng(5)
 # What another baud rate makes of a stream: few bytes, in any order.
 BAUD = np.array([0, 0xF8, 0xFE, 0x80, 0xE0, 0x1E, 0x66, 0x9E, 0xFF], np.uint8)
