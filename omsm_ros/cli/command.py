@@ -64,7 +64,7 @@ def rejected(facts: Facts) -> str:
 
 
 def table(rows: list[tuple[str, str]]) -> None:
-    """Print names and values in two columns."""
-    width = max(len(name) for name, _ in rows)
+    """Print names and values in two columns; nothing where there are none."""
+    width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:<{width}}  {value}")

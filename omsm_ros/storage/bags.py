@@ -200,7 +200,7 @@ class BagReader:
         return found
 
     def vibration(self) -> list[dict[str, Any]]:
-        """Each state of the levels that the vibration monitor told, in their order."""
+        """Return each state of the levels that the vibration monitor reported, in their order."""
         if not self.count([VIBRATION_TOPIC]):
             return []
         return [told for _, told in self.records(VIBRATION_TOPIC)]

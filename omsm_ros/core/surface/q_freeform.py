@@ -53,14 +53,14 @@ class QFreeform:
             RADIUS.checked(self.radius, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height [m] at x, y [m]; NaN beyond the sphere's equator."""
+        """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
         square, c = np.square(x) + np.square(y), curvature_of(self.radius)
         root = root_of(1 - c**2 * square)
         departure, _, _ = self._departure(x, y)
         return np.asarray(c * square / (1 + root) + departure / root, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Slopes ∂z/∂x, ∂z/∂y [1]."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         c = curvature_of(self.radius)
         root = root_of(1 - c**2 * (np.square(x) + np.square(y)))
         departure, along_x, along_y = self._departure(x, y)
