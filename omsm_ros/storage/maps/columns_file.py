@@ -54,7 +54,7 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         header, first = _beginning(stream, what)
         names, scales = _columns(header, first, units, what)
         stream.seek(0)
-        body = io.TextIOWrapper(stream, encoding="utf-8", errors="replace")
+        body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
         table = _numbers(body, len(header), _delimiter(first), sorted(names.values()), what)
     at = {name: sorted(names.values()).index(place) for name, place in names.items()}
     column = {name: table[:, place] * scales[name] for name, place in at.items()}
@@ -84,7 +84,7 @@ def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
 
 def _decoded(raw: bytes) -> str:
     try:
-        return raw.decode("utf-8")
+        return raw.decode("utf-8-sig")  # some programs begin with a mark
     except UnicodeDecodeError:  # a µ as Windows writes it
         return raw.decode("latin-1")
 

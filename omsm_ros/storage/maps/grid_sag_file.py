@@ -51,7 +51,7 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
     """
     what = f"grid sag {str(path)!r}"
     with open_regular(path, FileError, "grid sag") as stream:
-        text = io.TextIOWrapper(stream, encoding="utf-8", errors="replace")
+        text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
         line = text.readline(_LONGEST_LINE)
         while line.startswith(_COMMENT) or line.isspace():
             line = text.readline(_LONGEST_LINE)

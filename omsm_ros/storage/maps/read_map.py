@@ -80,5 +80,5 @@ def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
 
 
 def _first_data_line(head: bytes) -> str:
-    lines = head.decode("utf-8", "replace").splitlines()
+    lines = head.decode("utf-8-sig", "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("!")), "")

@@ -22,6 +22,9 @@ from omsm_ros.storage.maps.optional import library
 # All points that are read, in eight bytes each, and what describes them.
 MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
 
+# Types of heights that an increment makes lengths of.
+_WHOLE = ("I", "L")
+
 
 def read_x3p(path: Path) -> MeasuredPoints:
     """Read the first layer of an x3p file, in its global frame.
@@ -54,6 +57,9 @@ def read_x3p(path: Path) -> MeasuredPoints:
 def _places(x3pio: Any, content: Any) -> FloatArray:
     """Return x, y, height (n, 3) [m] of the first layer; NaN = missing."""
     layer, header = content.layers[0], content.header
+    # Left out, it counts as one: heights in steps of a metre, which no instrument has.
+    if header.z.data_type.value in _WHOLE and header.z.increment == 1.0:
+        raise ValueError("its heights are whole numbers without an increment; save it with one")
     if isinstance(content, x3pio.PointCloud):
         places = np.asarray(layer.points(), np.float64)
     elif not header.x.is_incremental or (np.ndim(layer.z) == 2 and not header.y.is_incremental):

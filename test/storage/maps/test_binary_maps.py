@@ -3,6 +3,7 @@
 import struct
 import sys
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -185,6 +186,10 @@ def test_an_x3p_cloud_and_an_x3p_of_integers(tmp_path):
     )
     back = read_points(tmp_path / "i.x3p")
     assert np.sort(back.height) == pytest.approx(np.sort(made.height.ravel()), abs=2e-12)
+    steps = x3pio.Axis(x3pio.AxisType.ABSOLUTE, x3pio.DataType.INT16, 1.0)
+    header = SimpleNamespace(x=steps, y=steps, z=steps)
+    with pytest.raises(ValueError, match="whole numbers without an increment"):
+        x3p_file._places(x3pio, SimpleNamespace(layers=[made], header=header))
 
 
 def test_our_x3p_is_of_the_revision_that_all_take(tmp_path):

@@ -92,6 +92,21 @@ def test_columns_are_found_by_name_in_any_order(tmp_path):
     assert points.notes == ("1 other columns were left out",)
 
 
+@pytest.mark.parametrize("header", ["", "x_mm y_mm z_mm\n"])
+def test_a_mark_of_the_encoding_is_no_number_and_no_name(tmp_path, header):
+    """As editors of Windows write it: the first point was taken for a header before."""
+    path = tmp_path / "map.xyz"
+    path.write_bytes(b"\xef\xbb\xbf" + (header + "1 2 3\n4 5 6\n").encode())
+    points = read_points(path, units_of("mm"))
+    assert points.x == pytest.approx([1e-3, 4e-3])
+
+
+def test_a_grid_sag_with_a_mark_of_the_encoding_is_one(tmp_path):
+    path = tmp_path / "map.dat"
+    path.write_bytes(b"\xef\xbb\xbf" + b"5 5 1 1 0 0 0\n" + b"1 0 0 0 0\n" * 25)
+    assert len(read_points(path)) == 25
+
+
 def test_a_height_that_is_missing_is_counted(tmp_path):
     points = read_points(_text(tmp_path, "x_m y_m z_m\n0 0 1\n1 0 nan\n0 1 NaN\n1 1 2\n"))
     assert (len(points), points.missing) == (2, 2)
