@@ -52,8 +52,8 @@ def _show(facts: Facts) -> None:
     for topic in facts["topics"]:
         period = topic["sample_period"]
         print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
-    table(_vibration(facts["vibration"]))
-    table([("fault", text) for text in facts["faults"]] or [("faults", "none found")])
+    faults = [("fault", text) for text in facts["faults"]] or [("faults", "none found")]
+    table([*_vibration(facts["vibration"]), *faults])
 
 
 def _vibration(found: Facts | None) -> list[tuple[str, str]]:

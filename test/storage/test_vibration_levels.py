@@ -69,8 +69,11 @@ def test_an_effect_that_nobody_knows_is_said_to_be_none(tmp_path, capsys):
     assert "not evaluated: no calibration" in capsys.readouterr().out
 
 
-def test_a_bag_without_levels_has_none(tmp_path):
-    assert inspect_bag(record(tmp_path / "a.mcap")).vibration is None
+def test_a_bag_without_levels_has_none(tmp_path, capsys):
+    path = record(tmp_path / "a.mcap")
+    assert inspect_bag(path).vibration is None
+    assert main(["inspect", str(path)]) == 0
+    assert "alarm in" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
