@@ -2,7 +2,7 @@
 
 A slow relaxation of size ε leaves G(0) = 1 and scales everything faster by 1 - ε, a little late.
 That changes the whole numerator and the delay; below ``valid_from`` the gain is one again. A mode
-or a stiffness that is remaining out is imitated by the fitted coefficients, which shifts them.
+or a stiffness that is left out is imitated by the fitted coefficients, which shifts them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class HiddenTerm:
 
     size, uncertainty: of the most significant term of the family, in its unit
     missed: largest size that the test would have missed with 5 % probability
-    shift: (p,) of the coefficients per unit, if the term is remaining out
+    shift: (p,) of the coefficients per unit, if the term is left out
     gain, late: (p,) change of the coefficients that scales the whole response by one, and that
         delays it by a second
     above: relative error of the gain at all frequencies above ``valid_from``, per unit
@@ -69,7 +69,7 @@ class HiddenTerm:
 
     @property
     def carried(self) -> float:
-        """Standard uncertainty of the size that is remaining out."""
+        """Standard uncertainty of the size that is left out."""
         return float(np.hypot(self.size, self.uncertainty))
 
     def covariance(self, carried: float) -> FloatArray:
