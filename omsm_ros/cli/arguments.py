@@ -118,6 +118,13 @@ def add_trigger(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def add_by_stamps(sub: argparse.ArgumentParser) -> None:
+    """Declare that axes and probe share no counter."""
+    sub.add_argument(
+        "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
+    )
+
+
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     """Return what is stated of the counters."""
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)

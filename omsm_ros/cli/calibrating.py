@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, add_trigger, cell_of, number, trigger_of
+from omsm_ros.cli.arguments import (
+    add_bags,
+    add_by_stamps,
+    add_trigger,
+    cell_of,
+    number,
+    trigger_of,
+)
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
@@ -38,6 +45,7 @@ def _declare_verify(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
     add_trigger(sub)
+    add_by_stamps(sub)
     sub.add_argument(
         "--find-offset",
         action="store_true",
@@ -52,7 +60,7 @@ def _verify(args: argparse.Namespace) -> Facts:
         if args.find_offset:
             established = established_offset(bag, calibration, progress)
             trigger = replace(trigger, counter_offset=established.samples)
-        check = path_check_of(bag, calibration, progress, trigger)
+        check = path_check_of(bag, calibration, progress, trigger, args.by_stamps)
     bands = [
         {
             "from": low,

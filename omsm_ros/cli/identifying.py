@@ -8,6 +8,7 @@ from pathlib import Path
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
     add_bags,
+    add_by_stamps,
     add_trigger,
     cell_of,
     json_object,
@@ -75,6 +76,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
     add_trigger(sub)
+    add_by_stamps(sub)
     sub.add_argument(
         "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
     )
@@ -96,6 +98,7 @@ def _identify(args: argparse.Namespace) -> Facts:
             duration=args.duration,
             time_lapse=(args.settings or {}).get("time_lapse", 1.0),
             trigger=trigger_of(args),
+            by_stamps=args.by_stamps,
             progress=progress,
         )
     if args.hold != BAND_LIMITED:
@@ -171,6 +174,7 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "id": calibration.id,
         "verdict": verdict,
         "reasons": reasons,
+        "reservations": calibration.certificate.get("reservations", []),
         "warnings": calibration.certificate.get("warnings", []),
         "order": len(calibration.dynamics.denominator) - 1,
         "low_frequency_delay": calibration.dynamics.low_frequency_delay,
@@ -205,8 +209,8 @@ def _show(facts: Facts) -> None:
             ("static gain", _stated(facts, "static_gain", "")),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
         ]
-    for kind in ("reasons", "warnings"):
-        rows += [(kind.removesuffix("s"), text) for text in facts[kind]]
+    for kind in ("reasons", "reservations", "warnings"):
+        rows += [(kind.removesuffix("s"), text) for text in facts.get(kind, [])]
     rows.append(("written to", facts.get("calibration") or facts["model"]))
     if "report" in facts:
         rows.append(("certificate", facts["report"]))

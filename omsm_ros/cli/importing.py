@@ -31,16 +31,16 @@ def _show_import(facts: Facts) -> None:
         kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
         print(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
         for count, meaning in (
-            ("missing", "trigger numbers are missing"),
-            ("invalid", "readings of the probe are none"),
-            ("lost", "rows have an axis that is no number"),
-            ("repeated_names", "lines repeat the line of names"),
-            ("passed_over", "messages hold none of the columns"),
+            ("missing", "trigger numbers that are missing"),
+            ("invalid", "readings that are none"),
+            ("lost", "rows where an axis is no number"),
+            ("repeated_names", "lines that repeat the names"),
+            ("passed_over", "messages with none of the columns"),
         ):
             if file[count]:
-                print(f"    {file[count]} {meaning}")
+                print(f"    {meaning}: {file[count]}")
     if any(file["own_clock"] for file in facts["files"]):
-        print("probe and axes have clocks of their own: correct with --by-stamps")
+        print("probe and axes have clocks of their own: identify and correct with --by-stamps")
     print(f"written: {facts['bag']}; look at it with 'omsm inspect'")
 
 

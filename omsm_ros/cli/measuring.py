@@ -11,6 +11,7 @@ from typing import Any
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
     add_bags,
+    add_by_stamps,
     add_trigger,
     cell_of,
     json_object,
@@ -74,9 +75,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     )
     _declare_uncertain(sub)
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
-    sub.add_argument(
-        "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
-    )
+    add_by_stamps(sub)
     sub.add_argument(
         "--delay",
         type=number(quantities.STAMP_DELAY),

@@ -11,6 +11,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.foreign_columns import (
     ColumnMap,
     Rows,
+    check_epoch,
     counter_of_times,
     counter_of_triggers,
     period_of,
@@ -47,6 +48,7 @@ class RowCounter:
         times = self._times(first)
         if times is None:
             return None, self._period
+        check_epoch(float(times[0]), self._mapped.columns["time"], self._mapped.start)
         self._period = period_of(times, self._mapped.sample_period)
         number = self._triggers(first)[0] if self._triggered else 0
         return float(times[0]) - number * self._period, self._period

@@ -22,12 +22,14 @@ def motion_of_bag(
     duration: float = 0.0,
     time_lapse: object = 1.0,
     trigger: CommonTrigger = EQUAL_COUNTS,
+    by_stamps: bool = False,
     progress: Progress = no_progress,
 ) -> MotionRecord:
     """Return the motion in a bag, its first ``duration`` seconds (0 = all), ready to identify from.
 
     time_lapse: how much faster than real time the recording was played [1]
     trigger: what is stated of the counters of axes and distance
+    by_stamps: join both by their stamps, not by their counters
     The reference sensor is used where it was recorded.
 
     Raises DataError where the stamps contradict the sample period, or the counters each other.
@@ -43,7 +45,13 @@ def motion_of_bag(
     axes, distance, *reference = (_beginning(blocks[topic], duration) for topic in topics)
     for name, stream in (("axis", axes), ("distance", distance)):
         check_period(name, stream, faster)
-    return assemble(axes, distance, *reference, trigger=trigger)  # type: ignore[arg-type]
+    return assemble(  # type: ignore[misc]
+        axes,
+        distance,
+        *reference,
+        trigger=trigger,
+        by_stamps=by_stamps,  # type: ignore[arg-type]
+    )
 
 
 def settings_of_bag(path: AnyBag, stated: Mapping[str, object]) -> dict[str, object]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from omsm_ros.core.samples.foreign_columns import (
     distance_blocks,
     in_step,
 )
-from omsm_ros.errors import FileError
+from omsm_ros.errors import DataError, FileError
 from omsm_ros.jobs.foreign_rows import Origin, RowCounter
 from omsm_ros.jobs.read_bag import Progress, no_progress
 from omsm_ros.storage import bags
@@ -114,6 +114,15 @@ def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
             )
 
 
+@contextmanager
+def _told_of(file: str) -> Iterator[None]:
+    """Name the file where its rows cannot be counted."""
+    try:
+        yield
+    except DataError as err:
+        raise DataError(f"{file}: {err}") from err
+
+
 class _Stream:
     """Files of the same columns, one after the other, and the count of their rows."""
 
@@ -122,7 +131,9 @@ class _Stream:
         channels = sources[0].channels
         self.triggered = "trigger" in channels
         self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
-        self.begins, self.period = self.counter.begin(sources[0].first())
+        first = sources[0].first()
+        with _told_of(sources[0].found.file):
+            self.begins, self.period = self.counter.begin(first)
 
     def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
         """Yield the blocks of all files."""
@@ -196,7 +207,8 @@ class _Source:
         """Yield the file's blocks; ``counter`` goes on from the file before."""
         found = self.found
         for piece in self._pieces():
-            rows = counter.count(piece)
+            with _told_of(found.file):
+                rows = counter.count(piece)
             skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
             self._last = int(rows.counter[-1])
             found.missing += int(np.sum(skipped))

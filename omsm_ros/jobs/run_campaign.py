@@ -103,7 +103,8 @@ def run_campaign(
     found = bags_below(folder, out)
     if not found:
         raise FileError(
-            f"no bag below {str(folder)!r}; give a folder of .mcap files or rosbag2 bags"
+            f"no bag below {str(folder)!r}; give a folder of .mcap files or rosbag2 bags; "
+            "other recordings become bags by 'omsm import'"
         )
     sign = [load_calibration(calibration).id, *options, __version__]
     with _alone(out):

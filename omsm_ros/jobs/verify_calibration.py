@@ -21,12 +21,14 @@ def path_check_of(
     calibration: Calibration,
     progress: Progress = no_progress,
     trigger: CommonTrigger = EQUAL_COUNTS,
+    by_stamps: bool = False,
 ) -> PathCheck:
     """Return the paper's Fig. 9: errors and phase lags of a free path on a fixed target.
 
     trigger: what is stated of the counters of axes and distance
+    by_stamps: join both by their stamps, not by their counters
     """
-    record = motion_of_bag(path, trigger=trigger, progress=progress)
+    record = motion_of_bag(path, trigger=trigger, by_stamps=by_stamps, progress=progress)
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     return check_path(
         record.z,

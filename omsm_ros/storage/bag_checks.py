@@ -51,6 +51,22 @@ def translated(path: Path, remedy: str) -> Iterator[None]:
         ) from err
 
 
+_ROS_1_MAGIC = b"#ROSBAG V"
+_TABLES = (".csv", ".tsv", ".txt", ".npy", ".npz", ".mat", ".h5", ".hdf5", ".tdms")
+
+
+def check_kind(path: Path) -> None:
+    """Raise BagError for a file that becomes a bag of ours by ``omsm import`` alone."""
+    with open_regular(path, BagError, "bag") as stream:
+        of_ros_1 = stream.read(len(_ROS_1_MAGIC)) == _ROS_1_MAGIC
+    if of_ros_1 or path.suffix.lower() in _TABLES:
+        kind = "a bag of ROS 1" if of_ros_1 else "a table, no bag"
+        raise BagError(
+            f"{str(path)!r} is {kind}; make a bag of it: 'omsm import FILE --map MAP.yaml --out "
+            "BAG.mcap', where the map names its columns"
+        )
+
+
 def check_files(path: Path) -> None:
     """Raise BagError unless ``path`` is a regular file or a folder of such."""
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:

@@ -26,6 +26,7 @@ from omsm_ros.storage.bag_checks import (
     check_definition,
     check_files,
     check_index,
+    check_kind,
     translated,
     unpacked_message,
 )
@@ -109,6 +110,8 @@ class BagReader:
             if not self.path.exists():
                 raise BagError(f"no bag at {str(self.path)!r}; check the path")
             check_files(self.path)
+            if self.path.is_file():
+                check_kind(self.path)
             self._reader = opening.enter_context(Reader(self.path))
             check_index(self.path, self._reader)
             check_checksums(self.path)
@@ -276,7 +279,8 @@ class BagReader:
             held = ", ".join(t.topic for t in self.topics()) or "nothing"
             raise BagError(
                 f"{str(self.path)!r} has no topic {name!r}; it holds {held:.500}. "
-                "Record the raw topics of the cell, or name them with --namespace or --topics"
+                "Record the raw topics of the cell, name them with --namespace or --topics, or "
+                "make a bag of other messages with 'omsm import'"
             )
         for connection in found:
             if connection.msgtype != TOPIC_TYPES[topic]:

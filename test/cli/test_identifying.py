@@ -1,6 +1,7 @@
 """``omsm identify`` of tables, and of bags behind a hold."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy import signal
 
 from omsm_ros import cli
 from omsm_ros.storage import bags
+from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
@@ -158,3 +160,33 @@ def test_a_rejected_model_replaces_none(capsys, tmp_path):
     assert "rejected" in said.err
     assert out.read_text() == "a good one"
     assert (tmp_path / "model.rejected.json").exists()
+
+
+def test_a_bag_of_two_counters_is_identified_by_its_stamps(capsys, step_test, tmp_path):
+    with BagWriter(tmp_path / "two.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in blocks_of(step_test):
+            bag.write_axes(axes)
+            bag.write_distance(replace(distance, first_sample=distance.first_sample + 10**6))
+    arguments = (tmp_path / "two.mcap", "--order", 2, "--out", tmp_path / "cal.json")
+    status, said = run(capsys, *arguments)
+    assert status == 2
+    assert "--by-stamps" in said.err
+    status, said = run(capsys, *arguments, "--by-stamps")
+    assert status == 0, said.err
+    assert "accepted with reservations" in said.out
+    assert "reservation  probe and axes were joined by their stamps" in said.out
+    calibration = load_calibration(tmp_path / "cal.json")
+    slow = 0.1
+    true = -np.angle(step_test.truth.response.response(slow)) / (2 * np.pi * slow)
+    off = calibration.dynamics.low_frequency_delay - float(true)
+    assert abs(off) < 3 * calibration.low_frequency_delay_uncertainty
+
+
+def test_what_becomes_a_bag_by_import_alone_says_so(capsys, table, tmp_path):
+    old = tmp_path / "old.bag"
+    old.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    for path, kind in ((old, "a bag of ROS 1"), (table, "a table, no bag")):
+        assert cli.main(["inspect", str(path)]) == 2
+        said = capsys.readouterr().err
+        assert kind in said
+        assert "omsm import" in said

@@ -114,6 +114,44 @@ def test_seconds_since_1970_set_the_clock(read):
     assert abs(read.importer.blocks()[0].stamp_ns - 1763200000_250_000_000) < 1000
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_parts_of_a_second_since_1970_set_the_clock_where_they_are_told(read, unit, scale):
+    rows = [f"{round((1763200000.25 + i / 100) * scale)},{i}" for i in range(3)]
+    text = "\n".join(["t,d", *rows])
+    # Told otherwise, the date would be lost, or another one made of it.
+    for other in ("unix", unit):
+        said = refusal(read, text, DATED.replace("date", other))
+        assert f"write unit: unix_{unit}" in said
+    read(text, DATED.replace("date", f"unix_{unit}"))
+    assert abs(read.importer.blocks()[0].stamp_ns - 1763200000_250_000_000) < 1000
+    read.importer.out.unlink()
+    read(text, "start: 1.0\n" + DATED.replace("date", unit))
+    assert read.importer.blocks()[0].stamp_ns == 1_000_000_000
+
+
+def test_stamps_that_jitter_are_told_from_a_wrong_period(read):
+    random = np.random.default_rng(1)
+    rows = [f"{1763200000 + i / 1000 + random.normal(0, 2e-4):.6f},{i}" for i in range(3000)]
+    mapping = DATED.replace("date", "unix") + "sample_period: 0.001\n"
+    said = refusal(read, "\n".join(["t,d", *rows]), mapping).replace("\n", " ")
+    assert "leave time out and state sample_period" in said
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("0,1\n1,2\n1,2\n2,3\n", "trigger 1 is followed by 1; delete the row"),
+        ("0,1\n2,2\n1,3\n", "trigger 2 is followed by 1; delete the row"),
+        ("0,1\nnan,2\n2,3\n", "trigger is nan in the row after 0, expected whole"),
+        ("0,1\n1.5,2\n2,3\n", "trigger is 1.5 in the row after 0, expected whole"),
+    ],
+)
+def test_a_trigger_that_does_not_count_is_named_with_its_file(read, rows, said):
+    told = refusal(read, "i,d\n" + rows, PROBE + "  trigger: {name: i}\n")
+    assert said in told
+    assert "a.csv" in told
+
+
 # Refused in one line.
 
 
@@ -122,12 +160,14 @@ def test_seconds_since_1970_set_the_clock(read):
     [
         ("i;d\n0;1.234,5\n", 'delimiter: ";"\ndecimal: ","\n', "thousands"),
         ("i;d\n0;1.234\n", 'delimiter: ";"\ndecimal: ","\n', "thousands"),
-        ("i,d\n0,1 234.5\n", "", "line 2"),
+        ("i,d\n0,1 234.5\n", "", "between thousands"),
+        ("i;d\n0;1'234\n", 'delimiter: ";"\n', "between thousands"),
+        ('i;d\n0;"1,234.5"\n', 'delimiter: ";"\n', "between thousands"),
         ('i,d\n0,"1,234.5"\n', "", "3 cells under 2 names"),
         ("i\td\n0\t1,5\n", 'delimiter: "\\t"\n', "decimal: ','"),
         ("i;d\n0;1\n", "", "delimiter: ';'"),
         ("Logger 7\nno. 12\ni,d\n0,1\n", "", "lines_before_names: 2"),
-        ("i,d\n,um\n0,1\n", "", "line 2"),
+        ("i,d\n,um\n0,1\n", "", "lines_after_names: 1"),
         ("i,d\n0,1\nmean,1\n", "", "line 3"),
         ("i,d\n0,1\n1,2\n2", "", "was it cut"),
         ("i,d\n0,---\n", "", "invalid: ['---']"),

@@ -68,6 +68,19 @@ def timing(scatter: float) -> Finding:
     )
 
 
+def two_clocks(by_stamps: bool) -> Finding:
+    """Reserve a record whose streams were joined by the stamps of two clocks."""
+    if not by_stamps:
+        return Finding()
+    return Finding(
+        reservations=(
+            "probe and axes were joined by their stamps: what their clocks differ by is part of "
+            "the lag, and in no uncertainty; keep both clocks as they are for the scan, or latch "
+            "both by one trigger",
+        )
+    )
+
+
 def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: float) -> Finding:
     """Judge a probe that moves before the encoder by -``lag`` [s], u = ``uncertainty`` [s].
 
@@ -176,6 +189,7 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
         e.residual.noise,
     ),
     lambda e: timing(e.residual.timing),
+    lambda e: two_clocks(e.record.by_stamps),
     lambda e: departures(e.searched),
     lambda e: independence(e.searched.survey.independence),
     lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),

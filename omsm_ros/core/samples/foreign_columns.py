@@ -47,15 +47,20 @@ _TIMES = {
 DATE = "date"
 """The unit of instants that are no numbers in the file: dates in text, stamps of messages."""
 
-UNIX = "unix"
-"""The unit of times in seconds since 1970."""
+SINCE_1970 = {
+    "unix": 1.0,
+    "unix_ms": MILLISECOND_S,
+    "unix_us": MICROSECOND_S,
+    "unix_ns": NANOSECOND_S,
+}
+"""Units of times since 1970, and what one of them is in seconds."""
 
 UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         **dict.fromkeys(("x", "y", "z", "distance"), _LENGTHS),
         **dict.fromkeys(("b", "c"), _ANGLES),
         "intensity": {"1": 1.0, "%": 0.01},
-        "time": {**_TIMES, UNIX: 1.0, DATE: 1.0},
+        "time": {**_TIMES, **SINCE_1970, DATE: 1.0},
         "trigger": {"1": 1.0},
     }
 )
@@ -72,6 +77,10 @@ _NOT_RISING = (
 )
 # A time that is off by more lies nearer to no sample than to its neighbour.
 _MOST_JITTER = 0.25
+# The years 2000 and 2100, of stamps that a set clock gave [s since 1970].
+_STAMPED_S = (946_684_800.0, 4_102_444_800.0)
+# Rows off the grid by that much, of which more than one in a hundred is no single slip.
+_MOST_UNEVEN = 0.01
 # Clocks of two devices differ by less than 0.1 %; a period written wrongly by more.
 MOST_PERIOD_ERROR = 1e-3
 
@@ -136,7 +145,7 @@ class ColumnMap:
     @property
     def dated(self) -> bool:
         """Return whether the column of time holds instants since 1970."""
-        return "time" in self.columns and self.columns["time"].unit in (DATE, UNIX)
+        return "time" in self.columns and self.columns["time"].unit in (DATE, *SINCE_1970)
 
     def names(self, channels: tuple[str, ...]) -> list[str]:
         """Return the columns of the file that ``channels`` need, without those that stand still."""
@@ -158,6 +167,27 @@ def in_step(starts: Sequence[float], periods: Sequence[float]) -> bool:
     return alike and all(abs(place - round(place)) <= _MOST_JITTER for place in places)
 
 
+def check_epoch(first: float, time: Column, start: float) -> None:
+    """Raise DataError where the column ``time`` begins at ``first`` [s], another unit's instant.
+
+    start: as the map states it [s, Unix]; with it, times since 1970 may be in any unit of time
+    """
+    raw = first / time.factor
+    low, high = _STAMPED_S
+    fitting = [unit for unit, factor in SINCE_1970.items() if low <= raw * factor <= high]
+    if not fitting or time.unit in (*fitting, DATE):
+        return
+    if time.unit in SINCE_1970:
+        raise DataError(
+            f"time begins at {raw:.13g}, no instant in {time.unit}; write unit: {fitting[0]}"
+        )
+    if SINCE_1970[fitting[0]] == abs(time.factor) and not start:
+        raise DataError(
+            f"time begins at {raw:.13g} {time.unit}, which looks like a date; write unit: "
+            f"{fitting[0]} where it counts from 1970, or else the start"
+        )
+
+
 def period_of(times: FloatArray, stated: float | None) -> float:
     """Return the sample period [s] that ``times`` (n,) [s] have, or ``stated`` where they agree.
 
@@ -175,10 +205,16 @@ def period_of(times: FloatArray, stated: float | None) -> float:
         )
     found = float(np.median(steps))
     whole = np.maximum(np.round(steps / found), 1.0)
+    uneven = float(np.mean(np.abs(steps / found - whole) > _MOST_JITTER))
     found = float((times[-1] - times[0]) / np.sum(whole))
     if stated is None:
         return float(SAMPLE_PERIOD.checked(found, DataError, "sample period of the column time"))
     if abs(found / stated - 1) > MOST_PERIOD_ERROR:
+        if uneven > _MOST_UNEVEN:
+            raise DataError(
+                f"{100 * uneven:.0f} % of the times lie off an even grid; where"
+                " only the stamping is uneven, leave time out and state sample_period"
+            )
         raise DataError(
             f"sample_period is {stated:g} s, but the column of time says {found:.6g} s; "
             "correct the one that is wrong, or its unit"
@@ -217,7 +253,11 @@ def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
     """Return the trigger number (n,) of each row; DataError unless whole and rising."""
     if not np.all(np.isfinite(values)) or np.any(values != np.round(values)):
         bad = int(np.argmax(~np.isfinite(values) | (values != np.round(values))))
-        raise DataError(f"trigger is {values[bad]!r} in a row, expected whole numbers")
+        last = before if bad == 0 else values[bad - 1]
+        raise DataError(
+            f"trigger is {values[bad]:.15g} in the row after {last:.15g}, expected whole numbers; "
+            "correct that row, or delete it"
+        )
     COUNTER.checked_all(values, DataError, "trigger")
     counter = values.astype(np.int64)
     steps = np.diff(counter, prepend=before)
@@ -225,7 +265,8 @@ def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
         row = int(np.argmax(steps <= 0))
         raise DataError(
             f"trigger {counter[row] - steps[row]} is followed by {counter[row]}; "
-            "import the parts before and after it one by one"
+            "delete the row that repeats or comes late, or import what lies before and after it "
+            "one by one"
         )
     return counter
 

@@ -45,6 +45,7 @@ class MotionRecord:
     ok: True where both are measured and to be trusted
     reference: second sensor along the same motion [m], NaN where it has no reading, or None
     z_lost: True where z is interpolated, or None where it never is
+    by_stamps: whether two clocks, not one trigger, say which samples belong together
     counts: what became of every sample received
 
     Raises DataError when the arrays do not fit each other.
@@ -56,6 +57,7 @@ class MotionRecord:
     ok: BoolArray
     reference: FloatArray | None = None
     z_lost: BoolArray | None = None
+    by_stamps: bool = False
     counts: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -107,8 +109,11 @@ def assemble(
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock] = (),
     trigger: CommonTrigger = EQUAL_COUNTS,
+    by_stamps: bool = False,
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
+
+    by_stamps: join them by their stamps, as those of different rates are, whatever they count
 
     Raises DataError when nothing can be paired, when it is more than one recording, or when the
     counters of axes and distance slipped against each other.
@@ -120,7 +125,7 @@ def assemble(
         )
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
-    if abs(probe_period / period - 1) < SAME_PERIOD:
+    if abs(probe_period / period - 1) < SAME_PERIOD and not by_stamps:
         return _by_counter(axes, distance, reference, period, trigger)
     return _by_stamp(axes, distance, reference)
 
@@ -222,9 +227,9 @@ def _by_counter(
     if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
             f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
-            f"{distance[0].first_sample} share no trigger count at the same time: they are not of "
-            f"one recording, or their stamps differ by over {STAMP_TOLERANCE_S} s; record both "
-            "at the same time, with clocks that agree"
+            f"{distance[0].first_sample} share no trigger count at the same time: record both "
+            f"at once, with stamps that differ by less than {STAMP_TOLERANCE_S} s, or, where each "
+            "counts for itself, join them by their stamps (--by-stamps)"
         )
     own = replace(trigger, counter_offset=0)
     return MotionRecord(
@@ -274,7 +279,8 @@ def _by_stamp(
         carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
         second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
     record = _covered(_by_counter(moved, grid, second, probe_period / finer))
-    return replace(record, counts=_unfilled(record.counts, distance, finer))
+    counts = _unfilled(record.counts, distance, finer)
+    return replace(record, counts=counts, by_stamps=True)
 
 
 def _refined(block: DistanceBlock, finer: int) -> DistanceBlock:

@@ -1,7 +1,7 @@
 """Tables in files of arrays: NumPy, MATLAB, HDF5.
 
 A column of a table is named ``dataset[3]``, counted from 0; a plain array's columns are ``[0]``,
-``[1]`` and so on.
+``[1]`` and so on. What lies in a group, a MATLAB structure or a structured array is ``group/name``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ArrayTable(ForeignTable):
         if size > _MAX_WHOLE_BYTES and read != self._hdf5:
             raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
         try:
-            self._arrays = read()
+            self._arrays = dict(_flat("", read()))
         except FileError:
             raise
         except Exception as err:  # whatever a library says of a damaged file
@@ -73,8 +73,8 @@ class ArrayTable(ForeignTable):
         with open_regular(self.path, FileError, "table") as stream:
             if stream.read(10) == b"MATLAB 7.3":  # which is HDF5 under another name
                 return self._hdf5()
-        loaded = loadmat(self.path, squeeze_me=True, mat_dtype=True)
-        return {name: v for name, v in loaded.items() if isinstance(v, np.ndarray)}
+        loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
+        return loaded
 
     def _hdf5(self) -> Mapping[str, Any]:
         try:
@@ -121,3 +121,19 @@ class ArrayTable(ForeignTable):
         indexed = _INDEXED.fullmatch(name)
         assert indexed is not None  # it is one of self.names
         return self._arrays[indexed[1]], int(indexed[2])
+
+
+def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:
+    """Yield every array in ``found`` with its name; those of a structure below the name of it."""
+    if isinstance(found, Mapping):
+        parts = list(found.items())
+    elif fields := getattr(getattr(found, "dtype", None), "names", None):
+        # A field of a data set in a file is a view, of an array in memory its part.
+        read = found.fields if hasattr(found, "fields") else found.__getitem__
+        parts = [(field, read(field)) for field in fields]
+    else:
+        if hasattr(found, "dtype"):
+            yield name, found
+        return
+    for part, value in parts:
+        yield from _flat(f"{name}/{part}" if name else part, value)

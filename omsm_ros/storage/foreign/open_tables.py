@@ -25,10 +25,9 @@ def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[Fore
     table = _table(path, suffix, form)
     if not any(table.names.count(name) == 1 for name in wanted):
         table.close()
-        hint = table.hint(wanted) or "name the columns as its line of names does, each once"
-        raise FileError(
-            f"{table} has none of the columns {list(wanted)}, but {table.names[:20]}; {hint}"
-        )
+        hint = table.hint(wanted) or "name the columns as it does, each once"
+        held = table.names[:20] or "no column of numbers at all"
+        raise FileError(f"{table} has none of the columns {list(wanted)}, but {held}; {hint}")
     return [table]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import io
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -33,6 +34,8 @@ _NO_TEXT = {
     b"\x89MCA": "it is a ROS bag; name it .mcap",
 }
 _DELIMITERS = (";", "\t", ",", "|")
+# 1 234, 1'234 or 1,234.5, of which 1,234 alone may be a decimal comma; spaces may be narrow.
+_GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)?|.*,.*\\..*")
 
 
 class TextTable(ForeignTable):
@@ -170,11 +173,17 @@ class TextTable(ForeignTable):
                 bad = middle
         number, line = lines[good]
         return FileError(
-            f"{self}, line {number}: {shown(line.strip())} is no row; {self._remedy(line, rows)}"
+            f"{self}, line {number}: {shown(line.strip())} is no row; "
+            f"{self._remedy(number, line, rows)}"
         )
 
-    def _remedy(self, line: str, rows: _Rows) -> str:
+    def _remedy(self, number: int, line: str, rows: _Rows) -> str:
         cells = self._cells(line)
+        of_units = number == self._first_row + 1 and not any(map(_is_number, cells))
+        if of_units and self._form.named and len(cells) == len(self.names):
+            return "if it is a line of units, write lines_after_names: 1 into the map"
+        if any(_GROUPED.fullmatch(cell.strip().strip('"')) for cell in cells):
+            return "write numbers without marks between thousands"
         if self._form.decimal == "." and self._form.delimiter != "," and "," in line:
             return "for decimal commas, write decimal: ',' into the map"
         if self._form.decimal == "." and ";" in line and "," in line:

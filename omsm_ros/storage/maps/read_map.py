@@ -18,7 +18,7 @@ from omsm_ros.storage.maps.vertex_file import read_pcd, read_ply
 from omsm_ros.storage.maps.x3p_file import read_x3p
 
 _HEAD_BYTES = 4096
-_BAG = b"\x89MCAP0\r\n"
+_BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V")
 _GRID_SAG_SUFFIXES = (".dat", ".grd")
 _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
@@ -43,10 +43,10 @@ def _head(path: Path) -> bytes:
         head = stream.read(_HEAD_BYTES)
     if not head:
         raise FileError(f"map {str(path)!r} is empty; write it again")
-    if head.startswith(_BAG):
+    if head.startswith(_BAGS):
         raise FileError(
             f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
-            "'omsm form' its --calibration, too"
+            "'omsm form' its --calibration, too; one of ROS 1 needs 'omsm import' first"
         )
     return head
 

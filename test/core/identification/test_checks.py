@@ -12,12 +12,19 @@ from omsm_ros.core.identification.checks import (
     requested_order,
     separable_gain,
     trusted_range,
+    two_clocks,
 )
 from omsm_ros.core.identification.covariance_terms import hidden_motion_finding
 
 LIMITS = ResponseLimits(gain=0.01, phase=0.02)
 SLOW = TransferFunction.from_ascending([1.0], [1.0, 1e-2])
 FAST = TransferFunction.from_ascending([1.0], [1.0, 1e-4])
+
+
+def test_two_clocks_are_a_reservation():
+    assert not two_clocks(False).reservations
+    (said,) = two_clocks(True).reservations
+    assert "part of the lag" in said
 
 
 def test_good_evidence_gives_no_reason_and_no_warning():

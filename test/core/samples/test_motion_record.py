@@ -1,5 +1,7 @@
 """Pairing of the streams of one recording."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -124,6 +126,21 @@ def test_streams_of_different_rates_meet_in_time(axis_period, probe_period):
     )
     assert record.sample_period == pytest.approx(0.25e-3)
     np.testing.assert_allclose(record.z[record.ok], -record.distance[record.ok], atol=1e-7)
+
+
+def test_streams_that_count_for_themselves_meet_in_time_where_that_is_asked_for():
+    time = np.arange(1000) * 1e-3
+    moved = np.sin(2 * np.pi * 3 * time)
+    axes = [axis_block(moved)]
+    probe = [distance_block(-moved[100:900], first=5000)]
+    probe = [replace(block, stamp_ns=axes[0].stamp_ns + 100_000_000) for block in probe]
+    with pytest.raises(DataError, match="--by-stamps"):
+        assemble(axes, probe)
+    record = assemble(axes, probe, by_stamps=True)
+    assert record.by_stamps
+    assert np.sum(record.ok) == 800
+    np.testing.assert_allclose(record.z[record.ok], -record.distance[record.ok], atol=1e-9)
+    assert not assemble(axes, [distance_block(-moved)]).by_stamps
 
 
 def motion(time):
