@@ -18,9 +18,7 @@ def _completion(args: argparse.Namespace) -> Facts:
     try:
         import shtab
     except ImportError as err:
-        raise ConfigurationError(
-            "completion needs shtab: pip install 'omsm_ros[completion]'"
-        ) from err
+        raise ConfigurationError("completion needs shtab: pip install shtab") from err
     from omsm_ros.cli.main import parser_of  # which knows of this module
     from omsm_ros.cli.words import WORDS
 

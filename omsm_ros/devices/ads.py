@@ -151,5 +151,5 @@ def _pyads() -> Any:
     try:
         import pyads
     except ImportError as err:
-        raise DeviceError("ADS needs pyads: pip install 'omsm_ros[devices]'") from err
+        raise DeviceError("ADS needs pyads: pip install pyads") from err
     return pyads

@@ -204,5 +204,5 @@ def _nidaqmx() -> Any:
         import nidaqmx
         import nidaqmx.constants
     except ImportError as err:
-        raise DeviceError("daq:// needs nidaqmx: pip install 'omsm_ros[devices]'") from err
+        raise DeviceError("daq:// needs nidaqmx: pip install nidaqmx") from err
     return nidaqmx

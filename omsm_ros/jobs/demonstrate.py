@@ -199,7 +199,9 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
     summary["response"] = response_errors(calibration, true_response(step_test))
-    summary["live_equals_offline"] = same_points(live_points(plan.bag), cloud)
+    live = live_points(plan.bag)
+    summary["live_equals_offline"] = same_points(live, cloud)
+    summary["live_points"] = len(live)
     index = cloud["sample"].astype(np.int64)
     figures = surface_figures(
         view,
@@ -283,19 +285,33 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
     """Return the result for the terminal."""
-    rows = [*_sample_rows(summary), *_accuracy_rows(summary)]
+    rows = [*sample_rows(summary), *_accuracy_rows(summary)]
     width = max(len(name) for name, _ in rows)
     body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
     files = ", ".join(summary["files"].values())
     return f"\n{TITLE}\n\n{body}\n\n  in {os.path.relpath(plan.out)}: {files}\n"
 
 
-def _sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    """Yield names and texts of where the samples went."""
     for stream, account in summary["samples"].items():
         reasons = "".join(f", {n} {reason}" for reason, n in account["counted"].items() if n)
         value = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         yield f"samples of {stream}", value
-    yield "live cloud equals offline", "to the last bit" if summary["live_equals_offline"] else "NO"
+    yield "live cloud equals offline", _live_text(summary)
+
+
+def _live_text(summary: dict[str, Any]) -> str:
+    """Whether the corrector did live what was done offline, and what to do if it could not."""
+    if summary["live_equals_offline"]:
+        return "to the last bit"
+    left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]
+    if left_out <= 0:
+        return "NO"
+    return (
+        f"NO: {left_out} points were not made live, for this computer was too busy at that speed; "
+        "give a smaller --time-lapse"
+    )
 
 
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:

@@ -273,9 +273,7 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as err:
-        raise ConfigurationError(
-            "--scheduler needs Dask: pip install 'omsm_ros[campaign]'"
-        ) from err
+        raise ConfigurationError("--scheduler needs Dask: pip install distributed") from err
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TypeError) as err:

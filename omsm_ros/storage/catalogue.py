@@ -47,7 +47,7 @@ class Catalogue:
             import sqlalchemy
         except ImportError as err:
             raise ConfigurationError(
-                "a catalogue needs SQLAlchemy: pip install 'omsm_ros[catalogue]'"
+                "a catalogue needs SQLAlchemy: pip install sqlalchemy"
             ) from err
         self._sql = sqlalchemy
         sqlite = self.address.startswith("sqlite")

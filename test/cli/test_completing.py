@@ -52,4 +52,4 @@ def test_what_bash_offers(script, tmp_path, line, expected):
 def test_where_shtab_is_not_installed_the_remedy_is_told(capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "shtab", None)
     assert cli.main(["completion", "zsh"]) == 2
-    assert "pip install 'omsm_ros[completion]'" in capsys.readouterr().err
+    assert "pip install shtab" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 from written_disturbances import write_disturbances
 
 from omsm_ros.errors import FileError, OmsmError
-from omsm_ros.jobs.demonstrate import Demonstration, response_errors, true_response
+from omsm_ros.jobs.demonstrate import Demonstration, response_errors, sample_rows, true_response
 from omsm_ros.twin.catalogue import CATALOGUE
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
@@ -29,6 +29,22 @@ def test_the_emulator_is_given_the_file_by_its_whole_path(tmp_path, monkeypatch)
     plan = Demonstration(tmp_path / "out", disturbance_file=(tmp_path / "d.yaml").relative_to("/"))
     assert Demonstration(tmp_path, disturbance_file=tmp_path / "d.yaml").disturbances == latency
     assert str(plan.emulator_parameters()["disturbances"]).startswith("/")
+
+
+@pytest.mark.parametrize(
+    ("live", "equal", "said"),
+    [
+        (1000, True, "to the last bit"),
+        (900, False, "NO: 100 points were not made live"),
+        (1000, False, "NO"),
+    ],
+)
+def test_a_live_cloud_that_differs_says_why(live, equal, said):
+    summary = {"live_equals_offline": equal, "live_points": live}
+    summary["samples"] = {"distance": {"received": 1010, "corrected": 1000, "counted": {}}}
+    (told,) = [text for name, text in sample_rows(summary) if name.startswith("live cloud")]
+    assert told.startswith(said)
+    assert ("--time-lapse" in told) == (live < 1000)
 
 
 def test_a_file_that_cannot_be_read_is_told_before_anything_is_cleared(tmp_path):

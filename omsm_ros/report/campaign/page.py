@@ -35,6 +35,7 @@ SERIES = (
     Series("Deviation, peak to valley", ("deviation", "corrected", "peak_to_valley")),
     Series("Dynamic error removed, rms", ("dynamic_error_before", "rms")),
     Series("Standard uncertainty, median", ("uncertainty", "median")),
+    Series("Scatter beyond what is stated, rms", ("uncertainty_budget", "scan_scatter")),
 )
 
 
@@ -155,7 +156,7 @@ def _row(
         "said": measurement.said,
         "state": measurement.state,
         "points": count(corrected) if received else NOTHING,
-        "lost": percent(1 - corrected / received) if received else NOTHING,
+        "left_out": percent(1 - corrected / received) if received else NOTHING,
         "cells": cells,
     }
 

@@ -205,10 +205,10 @@ def _departures(entries: tables.CertificateEntries) -> Section:
         (
             tables.departure_table(entries),
             tables.consistency_table(entries),
-            tables.hidden_table(entries),
+            reading.hidden_table(entries),
         ),
-        "A size that would be missed is one that this very test shows with a probability of "
-        "95 %; the band includes what the test cannot exclude.",
+        "Anything larger than the largest size missed, this very test would have shown with a "
+        "probability of 95 %; the band includes what it cannot exclude.",
     )
 
 
@@ -225,7 +225,14 @@ def sections(certificate: CertificatePage) -> list[Section]:
             ("step", "residual"),
             (tables.residual_table(entries), tables.sample_account(entries)),
         ),
-        Section("Order", ("order",), (tables.order_table(entries),)),
+        Section(
+            "Order",
+            ("order",),
+            (tables.order_table(entries),),
+            "Unless an order was asked for, the structure chosen has one parameter more than that "
+            "of the lowest BIC, and three at least: the smallest that fits is biased by about its "
+            "own uncertainty, and one parameter more trades that for a wider band.",
+        ),
         Section(
             "Dynamics",
             (),

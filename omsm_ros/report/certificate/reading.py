@@ -1,14 +1,15 @@
-"""What the identified response says of the machine: modes, masses and springs, its shape."""
+"""What the response says of the machine, and what could hide in it: modes, masses, shape."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from omsm_ros.core.departures.families import CREEP, MODE
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.modes import KnownMode, known_modes
 from omsm_ros.readable import NOTHING, measured, number, percent, plain, quantity
-from omsm_ros.report.certificate.tables import CertificateEntries, known_rows
+from omsm_ros.report.certificate.tables import CertificateEntries, known_rows, listed, texts
 from omsm_ros.report.common.tables import Table, part
 from omsm_ros.units import MILLISECOND_S
 
@@ -101,3 +102,41 @@ def _point(certificate: CertificateEntries, place: str, gain: str | None) -> str
     if gain is None or at == NOTHING:
         return at
     return f"{plain(part(certificate, 'shape', gain), 4)} at {at}"
+
+
+def _size(hidden: Mapping[str, Any]) -> str:
+    """The largest size that was missed, in the unit of its family."""
+    missed = number(hidden.get("missed"))
+    if missed is None or hidden.get("family") not in (CREEP, MODE):
+        return quantity(missed, "m")
+    return f"{percent(missed)} of the motion"
+
+
+def hidden_table(certificate: CertificateEntries) -> Table:
+    """Return what this very test would have missed, and what that costs on a scan."""
+    rows = [
+        (
+            str(entry.get("family", NOTHING)),
+            _size(entry),
+            quantity(entry.get("missed_effect_on_scan_m"), "m"),
+            quantity(entry.get("effect_on_scan_m"), "m"),
+        )
+        for entry in listed(certificate, "could_hide")
+    ]
+    return Table(
+        "What could hide",
+        ("largest size missed", "of it on the paper's scan", "in the band"),
+        rows
+        + known_rows(
+            [
+                (
+                    "plateau that would tell the slowest",
+                    quantity(certificate.get("plateau_that_would_tell_s"), "s"),
+                    "",
+                    "",
+                )
+            ],
+            1,
+        )
+        + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
+    )

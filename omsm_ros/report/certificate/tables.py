@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration
-from omsm_ros.readable import NOTHING, count, measured, number, plain, probability, quantity, raised
+from omsm_ros.readable import (
+    NOTHING,
+    count,
+    measured,
+    number,
+    plain,
+    probability,
+    quantity,
+    raised,
+)
 from omsm_ros.report.common.tables import Table, mapping_table, part
 from omsm_ros.units import PPM
 
@@ -226,36 +235,6 @@ def consistency_table(certificate: CertificateEntries) -> Table:
 def _ppm(value: object) -> float | None:
     known = number(value)
     return None if known is None else known / PPM
-
-
-def hidden_table(certificate: CertificateEntries) -> Table:
-    """Return what this very test would have missed, and what that costs on a scan."""
-    rows = [
-        (
-            str(entry.get("family", NOTHING)),
-            plain(entry.get("missed")),
-            quantity(entry.get("missed_effect_on_scan_m"), "m"),
-            quantity(entry.get("effect_on_scan_m"), "m"),
-        )
-        for entry in listed(certificate, "could_hide")
-    ]
-    return Table(
-        "What could hide",
-        ("largest size missed (95 %)", "of it on the paper's scan", "in the band"),
-        rows
-        + known_rows(
-            [
-                (
-                    "plateau that would show the slowest",
-                    quantity(certificate.get("plateau_that_would_tell_s"), "s"),
-                    "",
-                    "",
-                )
-            ],
-            1,
-        )
-        + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
-    )
 
 
 def coefficient_table(calibration: Calibration) -> Table:
