@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from omsm_ros import __version__, quantities
 from omsm_ros.cli.arguments import OneLineParser, number
+from omsm_ros.cli.at_work import at_work
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import DEBUG, OmsmError, defect, one_line
 from omsm_ros.storage import strict_json
@@ -181,7 +182,8 @@ def _split(given: list[str]) -> tuple[list[str], list[str]]:
 def _run(args: argparse.Namespace) -> int:
     if args.command == DEMO:
         return _demo(args)
-    facts = args.run.act(args)
+    with at_work(f"omsm {args.command}", args.json):
+        facts = args.run.act(args)
     if args.json:
         print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
     else:

@@ -115,7 +115,9 @@ class Stage:
         if plain and not self._quiet:
             print(f"· {title}", file=sys.stderr, flush=True)
         layout = (
-            "{desc:<44} {percentage:3.0f}% |{bar:30}| {elapsed}" if total else "{desc} {elapsed}"
+            "{desc:<44} {percentage:3.0f}% |{bar:24}| {remaining} left"
+            if total
+            else "{desc} {elapsed}"
         )
         with tqdm(
             desc=title, total=total or None, disable=self._quiet or plain, bar_format=layout
@@ -153,8 +155,17 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
         )
     with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
         _scan(node, plan.scan_samples, progress)
+    if plan.view:
+        _until_seen()
     with stage("ending the nodes"):
         processes.end()
+
+
+def _until_seen() -> None:
+    """Keep the live page up until whoever looks at it goes on; where nobody can, not at all."""
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        print("the live page stays until you press Enter ", end="", file=sys.stderr, flush=True)
+        sys.stdin.readline()
 
 
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:

@@ -220,7 +220,8 @@ class CorrectorNode(ManagedNode):
         """Return the account, and what is wrong with it now."""
         report = self._state.report(self._corrector, time.monotonic(), time.process_time())
         report.values["calibration"] = self._in_force_id()
-        if self._corrector is not None and self._topic.calibration is not None:
+        # Before there is a point, all that is uncertain would make nothing.
+        if self._state.published and self._corrector and self._topic.calibration is not None:
             light = live_light(
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
             )

@@ -111,7 +111,7 @@ class LivePage {
     const entries = [["points", told.points.toLocaleString("en").replaceAll(",", " ")]];
     if (told.left_out) entries.push(["without a place", String(told.left_out)]);
     if (last) entries.push(
-      ["dynamic error taken away", `${(1e9 * (last[2] - last[1])).toPrecision(3)} nm PV`],
+      ["dynamic error, last second", `${(1e9 * (last[2] - last[1])).toPrecision(3)} nm PV`],
       ["standard uncertainty", `${(1e9 * last[3]).toPrecision(3)} nm`]);
     const root = document.getElementById("numbers");
     root.replaceChildren(...entries.map(([name, value]) => {

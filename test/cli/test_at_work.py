@@ -1,0 +1,72 @@
+"""What a terminal sees of a command that takes long."""
+
+import io
+import sys
+import time
+
+import pytest
+
+from omsm_ros.cli import at_work as module
+from omsm_ros.cli.at_work import at_work
+
+LINE = "omsm form: 00:00 so far"
+
+
+class Terminal(io.StringIO):
+    tty = True
+
+    def isatty(self):
+        return self.tty
+
+    def waited_for(self, text, seconds=20.0):
+        end = time.monotonic() + seconds
+        while text not in self.getvalue() and time.monotonic() < end:
+            time.sleep(0.01)
+        return text in self.getvalue()
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A terminal as stderr, once it is asked for: pytest puts its own there before each test."""
+
+    def made(patience=0.02):
+        monkeypatch.setattr(sys, "stderr", Terminal())
+        monkeypatch.setattr(module, "_PATIENCE_S", patience)
+        monkeypatch.setattr(module, "_TICK_S", 0.01)
+        return sys.stderr
+
+    return made
+
+
+def test_long_work_counts_its_seconds_and_leaves_nothing_behind(terminal):
+    stderr = terminal()
+    with at_work("omsm form", quiet=False):
+        assert stderr.waited_for(LINE)
+    assert stderr.getvalue().endswith("\r")
+    assert stderr.getvalue().split("\r")[-2].strip() == ""
+
+
+def test_a_fault_finds_the_line_gone(terminal):
+    stderr = terminal()
+
+    def fails():
+        with at_work("omsm form", quiet=False):
+            assert stderr.waited_for(LINE)
+            raise ValueError("wrong")
+
+    with pytest.raises(ValueError, match="wrong"):
+        fails()
+    assert stderr.getvalue().split("\r")[-2].strip() == ""
+
+
+def test_short_work_programs_and_pipes_see_nothing(terminal):
+    stderr = terminal(patience=1000.0)
+    with at_work("omsm form", quiet=False):
+        pass
+    assert stderr.getvalue() == ""
+    stderr = terminal()
+    with at_work("omsm form", quiet=True):
+        assert not stderr.waited_for(LINE, 0.1)
+    stderr.tty = False
+    with at_work("omsm form", quiet=False):
+        assert not stderr.waited_for(LINE, 0.1)
