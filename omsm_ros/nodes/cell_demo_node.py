@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import rclpy
@@ -33,6 +34,7 @@ _DISCOVERY_S = 0.3
 _SERVICE_TIMEOUT_S = 60.0
 _STALL_TIMEOUT_S = 60.0
 _PREFIX = "/omsm/"
+_TICK_S = 0.5
 
 
 class DemoNode(Node):
@@ -103,6 +105,24 @@ class DemoNode(Node):
         return answer
 
 
+@contextmanager
+def _ticking(bar: tqdm[Any]) -> Iterator[None]:
+    """Let the seconds of a bar go on while nothing is counted."""
+    done = Event()
+
+    def tick() -> None:
+        while not done.wait(_TICK_S):
+            bar.refresh()
+
+    ticking = Thread(target=tick, daemon=True)
+    ticking.start()
+    try:
+        yield
+    finally:
+        done.set()
+        ticking.join()
+
+
 class Stage:
     """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
 
@@ -119,9 +139,11 @@ class Stage:
             if total
             else "{desc} {elapsed}"
         )
-        with tqdm(
-            desc=title, total=total or None, disable=self._quiet or plain, bar_format=layout
-        ) as bar:
+        silent = self._quiet or plain
+        with (
+            tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
+            _ticking(bar),
+        ):
             yield lambda done: bar.update(done - bar.n)
             bar.update((total or bar.n) - bar.n)
 
