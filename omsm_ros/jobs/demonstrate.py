@@ -302,7 +302,7 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _live_text(summary: dict[str, Any]) -> str:
-    """Whether the corrector did live what was done offline, and what to do if it could not."""
+    """Say whether the corrector did live what was done offline, and what to do if it could not."""
     if summary["live_equals_offline"]:
         return "to the last bit"
     left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]

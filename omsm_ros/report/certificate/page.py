@@ -212,6 +212,17 @@ def _departures(entries: tables.CertificateEntries) -> Section:
     )
 
 
+def _order(entries: tables.CertificateEntries) -> Section:
+    return Section(
+        "Order",
+        ("order",),
+        (tables.order_table(entries),),
+        "Unless an order was asked for, the structure chosen has one parameter more than that "
+        "of the lowest BIC, and three at least: the smallest that fits is biased by about its "
+        "own uncertainty, and one parameter more trades that for a wider band.",
+    )
+
+
 def sections(certificate: CertificatePage) -> list[Section]:
     """Return all parts below the first screen that have anything to show."""
     calibration = certificate.calibration
@@ -225,14 +236,7 @@ def sections(certificate: CertificatePage) -> list[Section]:
             ("step", "residual"),
             (tables.residual_table(entries), tables.sample_account(entries)),
         ),
-        Section(
-            "Order",
-            ("order",),
-            (tables.order_table(entries),),
-            "Unless an order was asked for, the structure chosen has one parameter more than that "
-            "of the lowest BIC, and three at least: the smallest that fits is biased by about its "
-            "own uncertainty, and one parameter more trades that for a wider band.",
-        ),
+        _order(entries),
         Section(
             "Dynamics",
             (),

@@ -105,7 +105,7 @@ def _point(certificate: CertificateEntries, place: str, gain: str | None) -> str
 
 
 def _size(hidden: Mapping[str, Any]) -> str:
-    """The largest size that was missed, in the unit of its family."""
+    """Return the largest size that was missed, in the unit of its family."""
     missed = number(hidden.get("missed"))
     if missed is None or hidden.get("family") not in (CREEP, MODE):
         return quantity(missed, "m")
