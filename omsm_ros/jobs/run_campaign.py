@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -114,8 +114,9 @@ def run_campaign(
         waiting = [task for task in tasks if task.bag not in entries]
         progress(len(entries), len(tasks))
         with _executor(jobs or os.cpu_count() or 1, scheduler) as executor:
-            for future in as_completed([executor.submit(correct_one, task) for task in waiting]):
-                entry = future.result()
+            asked = {executor.submit(correct_one, task): task for task in waiting}
+            for future in as_completed(asked):
+                entry = _told(future, asked[future])
                 entries[entry.bag] = entry
                 _save(out, entries)
                 progress(len(entries), len(tasks))
@@ -189,6 +190,15 @@ def correct_one(task: Task) -> Entry:
             break
         found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}"
     return Entry(task.bag, task.folder, task.fingerprint, *found)
+
+
+def _told(future: Future[Entry], task: Task) -> Entry:
+    """Return what became of a bag, also where every worker died that tried it."""
+    try:
+        return future.result()
+    except Exception as err:  # whatever a scheduler says of workers, or of its own end
+        why = f"no worker came to an end with it ({type(err).__name__})"
+        return Entry(task.bag, task.folder, task.fingerprint, CRASHED, why)
 
 
 def _task(

@@ -13,7 +13,7 @@ import pytest
 from omsm_ros import cli
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs import run_campaign as campaign
-from omsm_ros.jobs.run_campaign import CRASHED, DONE, REFUSED, load_campaign, run_campaign
+from omsm_ros.jobs.run_campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
 from omsm_ros.storage import bags, calibration_file
 from omsm_ros.storage.recording.bag_writer import BagWriter
 
@@ -91,6 +91,26 @@ def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch
     assert states(entries)["b.mcap"] == CRASHED
     assert "SIGKILL" in entries[1].said
     assert states(entries)["a.mcap"] == states(entries)["monday/c.mcap"] == DONE
+
+
+def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monkeypatch):
+    """Dask gives up a task that took four workers along, and raises what it calls it."""
+
+    class KilledWorker(Exception):
+        pass
+
+    def corrected(task):
+        if task.bag == "b.mcap":
+            raise KilledWorker("Attempted to run task 'b' on 4 different workers")
+        return Entry(task.bag, task.folder, task.fingerprint, DONE, "")
+
+    monkeypatch.setattr(campaign, "correct_one", corrected)
+    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)
+    assert [(e.bag, e.said) for e in entries if e.state == CRASHED] == [
+        ("b.mcap", "no worker came to an end with it (KilledWorker)")
+    ]
+    assert len(entries) == 4
+    assert load_campaign(tmp_path) == entries
 
 
 def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
