@@ -105,6 +105,9 @@ def test_inspect_counts_what_is_there(capsys, folder):
     axes = topics[bags.AXES_TOPIC]
     assert (axes["samples"], axes["gaps"], axes["restarts"]) == (40_000, 0, 0)
     assert axes["sample_period"] == 1e-3
+    status, text, err = run(capsys, "inspect", folder / "scan.mcap")
+    assert (status, err) == (0, "")
+    assert text.splitlines()[-1].split() == ["faults", "none", "found"]
 
 
 def test_a_cut_bag_is_repaired_beside_itself(capsys, folder, tmp_path):
