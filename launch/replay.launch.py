@@ -55,6 +55,7 @@ def generate_launch_description() -> LaunchDescription:
             {
                 "bag": _text("bag"),
                 "cell": _text("cell"),
+                "wait_for": "corrector",
                 "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
             }
         ],

@@ -43,6 +43,7 @@ PARAMETERS = (
     Parameter("clock", False, "publish the time of the bag on /clock"),
     Parameter("listeners", 1, "begin when so many nodes listen to each of axes and confocal",
               quantities.LISTENERS),
+    Parameter("wait_for", "", "nodes that have to be among them, e.g. 'corrector viewer'"),
 )  # fmt: skip
 RECORDED_POINTS = "recorded/points"
 """Where recorded points go if they are asked for: never among those that are corrected now."""
@@ -175,7 +176,14 @@ class PlayerNode(ManagedNode):
                 )
             if topic in _NEEDED and publisher.get_subscription_count() < self.values["listeners"]:
                 return f"nobody listens to {name} yet (parameter listeners)"
+            if topic in _NEEDED and (missing := self._missing(name)):
+                return f"{' and '.join(missing)} must listen to {name} first (parameter wait_for)"
         return "" if self._listeners.known else "who listens has not answered yet"
+
+    def _missing(self, name: str) -> list[str]:
+        """Who has to listen to the topic and does not: a recorder alone is no reason to begin."""
+        found = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
+        return [node for node in self.values["wait_for"].split() if node not in found]
 
     def _publish_next(self) -> None:
         assert self._next is not None

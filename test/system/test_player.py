@@ -95,6 +95,15 @@ def live_cloud(cell, path, calibration_file, **parameters):
     return np.concatenate([conversions.cloud_array(cloud) for cloud in clouds])
 
 
+def test_it_begins_only_when_those_listen_who_have_to(cell, small_scan_blocks):
+    for topic, kind in (("axes", AxisBlock), ("confocal", DistanceBlock)):
+        cell.operator.create_subscription(kind, f"/omsm/{topic}", lambda _: None, SAMPLES_QOS)
+    play(cell, record(cell.folder / "a.mcap", small_scan_blocks[:2]), wait_for="corrector")
+    text = cell.operator.text
+    cell.wait("its reason", lambda: "corrector must listen" in text("player", "message"))
+    assert cell.operator.value("player", "axes") == 0
+
+
 @pytest.mark.soak
 def test_at_any_rate_and_offline_the_clouds_are_equal(cell, small_scan_blocks, true_calibration):
     pairs = small_scan_blocks[:BLOCKS]
