@@ -160,8 +160,9 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             "# Disturbed step tests",
             "",
             "What `omsm identify` says of a step test on a machine that is not as it should be, "
-            "against the truth of the twin. `python -m benchmarks disturbed --full` writes this anew, "
-            f"from {_SEEDS} tests a case and {_PAIRS} pairs; how many it is from stands below. "
+            "against the truth of the twin. `python -m benchmarks disturbed --full` writes this "
+            f"anew, from {_SEEDS} tests a case and {_PAIRS} pairs; how many it is from stands "
+            "below. "
             "Error and stated uncertainty are of the linear response on the paper's scan, in the "
             "test that is farthest off; σ is the largest error of the response over what is "
             "stated, from 0.1 Hz to where it is trusted.",
