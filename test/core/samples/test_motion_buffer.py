@@ -66,3 +66,26 @@ def test_a_recording_of_an_earlier_day_is_a_new_motion():
     for first, seconds in ((0, 1e5), (100, 1e5 + 0.1), (0, 10.0)):
         buffer.add(block(first, stamp_ns=round(seconds * 1e9)))
     assert firsts(buffer) == [0]
+
+
+def test_blocks_of_one_sample_are_joined_and_none_of_them_is_lost():
+    buffer = BlockBuffer(3000)
+    for first in range(5000):
+        if first != 4321:  # a gap stays a gap
+            buffer.add(block(first, 1, stamp_ns=first * 1_000_000))
+    kept = buffer.recent()
+    assert len(kept) < 150
+    count = np.concatenate([np.arange(b.first_sample, b.end) for b in kept])
+    assert count.tolist() == [n for n in range(count[0], 5000) if n != 4321]
+    assert len(count) == len(buffer)
+    assert 2500 <= len(buffer) <= 3000
+    assert len(buffer) + buffer.forgotten == 4999
+    assert all(b.stamp_ns == b.first_sample * 1_000_000 for b in kept)
+
+
+def test_a_late_block_is_no_new_motion_where_short_ones_are_joined():
+    buffer = BlockBuffer(10_000)
+    for first in [*range(150), *range(151, 252), 150, *range(252, 400)]:
+        buffer.add(block(first, 1, stamp_ns=first * 1_000_000))
+    assert buffer.forgotten == 0
+    assert sum(map(len, buffer.recent())) == len(buffer) == 400
