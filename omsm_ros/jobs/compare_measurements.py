@@ -75,7 +75,8 @@ def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | No
 
     Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
     """
-    points = read_points(path, options.units)
+    units = options.units and replace(options.units, where_unsaid=True)
+    points = read_points(path, units)
     if nominal is not None and options.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)

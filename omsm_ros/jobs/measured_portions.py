@@ -18,7 +18,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import CLOUD, SYSTEMATIC
-from omsm_ros.storage.maps.length_units import LengthUnits, refuse_other
+from omsm_ros.storage.maps.length_units import NOT_USED, LengthUnits
 from omsm_ros.storage.maps.read_map import read_points
 
 _PORTION = 131_072
@@ -78,12 +78,14 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
         points = read_points(file, units)
         gridded = as_grid(points) is not None
         return Measurement(lambda: _slices(points), (), False, points.notes, gridded)
-    refuse_other(units, LengthUnits(1.0, 1.0), f"cloud {str(file)!r}")
+    notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
     if fields is None:
-        return Measurement(lambda: _portions(cloud, None), (), False)
-    return Measurement(lambda: _portions(cloud, fields), fields.names, True, bounds=fields.bounds)
+        return Measurement(lambda: _portions(cloud, None), notes, False)
+    return Measurement(
+        lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
+    )
 
 
 def _slices(points: MeasuredPoints) -> Iterator[Portion]:

@@ -238,15 +238,23 @@ def through_bag_files(place: Path, blocks: Any) -> Cases:
     return _with(_ON_BAGS, st.tuples(names, raw))
 
 
+def _without_unit(words: tuple[str, ...]) -> tuple[str, ...]:
+    at = words.index("--unit")
+    return words[:at] + words[at + 2 :]
+
+
 def right_cases(place: Path) -> Iterator[Case]:
     """Each command that the doors use on files that are written here, with right ones."""
     for wholes, commands in _DESCRIBED:
         for number, words in enumerate(commands):
             yield _case(words, "bad.yaml", json.dumps(wholes[-1 - number % len(wholes)]).encode())
     for words in _ON_MAPS:
+        if words[0] != "difference":  # whose unit is of the other file
+            words = _without_unit(words)
         yield _case(words, "bad.dat", (place / "good.dat").read_bytes())
     for name in maps.FORMATS:
-        yield Case(("export", name, "--unit", "mm", "--out", "e.xyz", "--json"))
+        words = ("export", name, "--unit", "mm", "--out", "e.xyz", "--json")
+        yield Case(_without_unit(words) if name in maps.SAY_METRES else words)
     for name in maps.TABLES[:2]:
         yield Case(("import", name, "--map", "map.yaml", "--out", f"{name}.mcap", "--json"))
     for words in (words for words in _ON_RESULTS if words[0] != "difference"):  # of an arc: none

@@ -64,6 +64,10 @@ FORMATS = ("good.xyz", "good.csv", "good.ply", "good.pcd", "good.dat", "good.x3p
            "zygo.dat")  # fmt: skip
 
 
+# A text that says its unit is refused where another one is stated.
+SAY_METRES = ("good.csv", "good.dat")
+
+
 @st.composite
 def renumbered(draw: st.DrawFn, whole: bytes, within: int = 1000) -> bytes:
     """Bytes with a few of the numbers that stand as text in their beginning replaced."""

@@ -173,7 +173,6 @@ def test_people_read_the_figures_too(folder, tmp_path, capsys):
         (["--aperture", "-1"], "expected R or R,X,Y"),
         (["--aperture", "0.001,0.05,0"], "0 points lie on"),
         (["--nominal", "{}/dust"], "dust"),
-        (["--unit", "mm"], "are in m, and --unit says mm"),
     ],
 )
 def test_bad_input_ends_in_one_line(folder, tmp_path, capsys, arguments, named):

@@ -20,6 +20,7 @@ _METRES = {
 }
 # Of two ways to write one factor.
 _ALIKE = 1e-9
+NOT_USED = "its format says in which units it is: --unit was not used"
 METRES = {name: factor for names, factor in _METRES.items() for name in names}
 """Metres in one of each unit."""
 
@@ -29,10 +30,12 @@ class LengthUnits:
     """What the numbers of a file count in: metres in one of them.
 
     lateral: of x and y;  height: of heights and their uncertainties
+    where_unsaid: True if given for several files, of those that do not say
     """
 
     lateral: float
     height: float
+    where_unsaid: bool = False
 
 
 def metres_in(name: str) -> float | None:
@@ -69,7 +72,7 @@ def refuse_other(units: LengthUnits | None, stated: LengthUnits, what: str) -> N
 
     One of the two is wrong by a factor, and nobody but the reader can tell which.
     """
-    if units is None:
+    if units is None or units.where_unsaid:
         return
     for name, given, own in (
         ("x and y", units.lateral, stated.lateral),

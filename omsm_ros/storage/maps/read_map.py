@@ -13,7 +13,7 @@ from omsm_ros.storage.maps.columns_file import read_columns
 from omsm_ros.storage.maps.dabam_file import has_dabam_header, read_dabam
 from omsm_ros.storage.maps.foreign_file import read_foreign
 from omsm_ros.storage.maps.grid_sag_file import is_grid_sag, read_grid_sag
-from omsm_ros.storage.maps.length_units import LengthUnits
+from omsm_ros.storage.maps.length_units import NOT_USED, LengthUnits
 from omsm_ros.storage.maps.vertex_file import read_pcd, read_ply
 from omsm_ros.storage.maps.x3p_file import read_x3p
 
@@ -59,7 +59,7 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         return read_pcd(path, units)
     if (found := _in_metres(path, head)) is not None:
         # Their layout fixes what they count in: nothing can contradict it.
-        unasked = ("its format says in which units it is: --unit was not used",) if units else ()
+        unasked = (NOT_USED,) if units else ()
         return replace(found, notes=(*found.notes, *unasked))
     if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
         return read_foreign(path, units)

@@ -15,7 +15,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.storage.files import open_regular, said, whole_file
-from omsm_ros.storage.maps.length_units import LengthUnits, needed, refuse_other
+from omsm_ros.storage.maps.length_units import NOT_USED, LengthUnits, needed
 from omsm_ros.storage.table_file import rows_in
 
 IN_METRES = "lengths in metres"
@@ -154,8 +154,6 @@ def _points(
     names = table.dtype.names or ()
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
     metres = LengthUnits(1.0, 1.0)
-    if ours:
-        refuse_other(units, metres, what)
     scale = metres if ours else needed(units, what)
     height = "height" if "height" in names else "z"
     spread = _quiet(table["uncertainty"]) if ours and "uncertainty" in names else None
@@ -164,6 +162,7 @@ def _points(
         _quiet(table["y"], scale.lateral),
         _quiet(table[height], scale.height),
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
+        notes=(NOT_USED,) if ours and units not in (None, metres) else (),
         sample=table["sample"] if ours and "sample" in names else None,
     )
 

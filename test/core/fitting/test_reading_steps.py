@@ -51,7 +51,7 @@ def test_noise_of_a_step_leaves_nothing():
 
 def recorded(seed):
     """A probe of 50 nm steps and a nanometre of noise, before a machine that lags."""
-    test, rng = StepTest(), np.random.default_rng(seed)
+    test, rng = StepTest(dwell=1.0), np.random.default_rng(seed)
     time = np.arange(0.0, test.duration, PERIOD)
     # No multiple of the probe's step.
     height, start = 0.983 + rng.uniform(0, 0.01), rng.uniform(0, STEP_M)

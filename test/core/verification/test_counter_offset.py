@@ -68,7 +68,7 @@ def test_the_fraction_is_as_uncertain_as_it_says() -> None:
         (steps(0)[:N], np.random.default_rng(0).normal(0, NOISE, N), "several offsets"),
         (steps(0)[:N], -0.3 * steps(0)[:N], "answers to Z with 0.3"),
         (*streams(2, lag=0.5), "no whole number"),
-        (steps(0)[:100], steps(0)[:100], "cannot tell"),
+        (steps(0)[:100], steps(0)[:100], "do not determine"),
     ],
     ids=["at rest", "repeats itself", "not a fixed target", "followed", "between", "short"],
 )

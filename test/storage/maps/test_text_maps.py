@@ -1,5 +1,7 @@
 """Text of points and grids: what carries its unit, what must be asked for it, what is no map."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,18 +61,25 @@ def test_a_unit_that_is_not_there_is_asked_for(tmp_path, header):
         ("a.xyz", "x_mm y_mm z_nm\n", "x and y are in mm, and --unit says um"),
         ("a.xyz", "x_um y_um z_nm\n", "heights are in nm, and --unit says um"),
         ("a.dat", "5 5 0.1 0.1 0 0 0\n", "x and y are in mm, and --unit says um"),
-        ("a.ply", None, "x and y are in m, and --unit says um"),
     ],
 )
 def test_a_unit_that_the_text_contradicts_is_refused(tmp_path, name, text, told):
     """One of the two is wrong by a thousand; the one in the text silently won before."""
     path = tmp_path / name
-    if text is None:
-        write_ply(path, np.zeros(9, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
-    else:
-        path.write_text(text + "1 2 3\n" * 25)
+    path.write_text(text + "1 2 3\n" * 25)
     with pytest.raises(FileError, match=f"{told}; leave --unit out"):
         read_points(path, units_of("um"))
+    # Of two files, the unit is that of the other.
+    read_points(path, replace(units_of("um"), where_unsaid=True))
+
+
+def test_a_cloud_of_ours_is_in_metres_and_a_note_says_so(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, np.ones(9, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
+    points = read_points(path, units_of("um"))
+    assert points.x.tolist() == [1.0] * 9
+    assert "--unit was not used" in points.notes[0]
+    assert read_points(path, units_of("m")).notes == ()
 
 
 def test_a_unit_that_the_text_says_too_is_taken(tmp_path):
