@@ -1,5 +1,7 @@
 import json
 
+import pytest
+
 from omsm_ros import cli
 from omsm_ros.cli import starting
 from omsm_ros.jobs.examine_host import Check
@@ -44,6 +46,7 @@ def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
     assert "exists" in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
     """Its step test is the one that is planned for a machine: what it could not show is small."""
     assert cli.main(["twin", "--out", str(tmp_path), "--json"]) == 0

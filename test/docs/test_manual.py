@@ -23,8 +23,8 @@ def commands_of(page):
     return [textwrap.dedent(b) for b in COMMANDS.findall(page.read_text(encoding="utf-8"))]
 
 
-# The tutorial shows nearly every command; `make soak` runs the others' pages, too.
-QUICK = ("tutorial", "first-calibration")
+# `make soak` runs all; the tutorial, which shows nearly every command, takes half a minute.
+QUICK = ("first-calibration",)
 
 
 @pytest.mark.timeout(180)

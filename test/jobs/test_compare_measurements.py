@@ -108,6 +108,7 @@ def test_a_map_of_another_instrument(results, tmp_path, capsys):
     assert facts["verdict"] == "differ"
 
 
+@pytest.mark.soak
 def test_the_nominal_surface_is_taken_off_both(results, tmp_path, capsys):
     nominal = tmp_path / "mirror.yaml"
     nominal.write_text(

@@ -106,6 +106,7 @@ def test_killed_and_restarted_emulator(cell, true_calibration):
         assert sum(counts.values()) == delivered
 
 
+@pytest.mark.soak
 def test_noise_on_the_wire(cell, true_calibration):
     cell.start_correcting(true_calibration, fault_noise=0.01, fault_flip=0.01, fault_drop=0.01)
     assert cell.call(Trigger, "cell_emulator/scan").success

@@ -23,6 +23,7 @@ def _bag(path, rise):
     return str(path)
 
 
+@pytest.mark.soak
 def test_a_certificate_is_filed_of_every_identification(cell):
     folder, output = cell.folder / "certificates", cell.folder / "cal.json"
     base = str(cell.folder / "base.sqlite")

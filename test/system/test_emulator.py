@@ -42,6 +42,7 @@ def test_stop_without_a_motion_does_no_harm(cell):
     cell.processes.check()
 
 
+@pytest.mark.soak
 def test_the_file_of_disturbances_is_played(cell):
     """An encoder that reads one per cent too long, seen at the driver's end of the wire."""
     file = cell.folder / "disturbances.yaml"

@@ -95,6 +95,7 @@ def single_samples(cell, count):
 
 
 @pytest.mark.parametrize("count", [3000, pytest.param(300_000, marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_blocks_of_one_sample_are_all_in_the_account(cell, true_calibration, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)

@@ -118,6 +118,7 @@ def test_at_any_rate_and_offline_the_clouds_are_equal(cell, small_scan_blocks, t
         assert same_points(cloud, offline), rate
 
 
+@pytest.mark.soak
 def test_at_rate_0_nothing_is_lost_by_who_stops_for_a_while(
     cell, small_scan_blocks, true_calibration
 ):

@@ -71,6 +71,7 @@ def test_an_order_asked_for_is_given_beside_the_free_choice():
     assert 2 <= found.free.order <= 4
 
 
+@pytest.mark.soak
 def test_twenty_poles_may_be_asked_for():
     rng = np.random.default_rng(4)
     angles = np.linspace(0.2, 2.8, 10)

@@ -74,7 +74,10 @@ def test_noise_is_not_taken_for_form(noise):
             assert figure.uncertainty < 1e-9 + 0.5 * noise
 
 
-@pytest.mark.parametrize("size", [1.0, 0.1, 0.0])
+@pytest.mark.parametrize(
+    "size",
+    [0.1, pytest.param(1.0, marks=pytest.mark.soak), pytest.param(0.0, marks=pytest.mark.soak)],
+)
 def test_two_uncertainties_hold_the_truth_of_any_part_nineteen_times_in_twenty(size):
     """A good part, a better one, and a perfect one, whose figures are all made by errors."""
     runs, true = 24, size * FORM

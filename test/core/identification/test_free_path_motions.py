@@ -60,7 +60,9 @@ def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, par
 
 
 @pytest.mark.parametrize(("frequency", "plant"), [(5.0, Plant()), (5.0, LIGHT_MODE)])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.soak), pytest.param(3, marks=pytest.mark.soak)]
+)
 def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
     """Gain and phase at one frequency are two numbers; static gain, lag and curvature are three."""
     sine = Multisine(frequencies=(frequency,), amplitude=20e-6)
@@ -77,7 +79,17 @@ def test_a_second_frequency_tells_them_apart():
     assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed",
+    [
+        0,
+        4,
+        pytest.param(1, marks=pytest.mark.soak),
+        pytest.param(2, marks=pytest.mark.soak),
+        pytest.param(3, marks=pytest.mark.soak),
+        pytest.param(5, marks=pytest.mark.soak),
+    ],
+)
 def test_an_even_ramp_may_be_drift(seed):
     rng = np.random.default_rng(seed)
     z = rng.normal(2e-9 * np.arange(20_000), 4e-10)

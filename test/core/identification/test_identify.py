@@ -28,7 +28,9 @@ from .recorded_motions import (
 
 
 class TestStepTest:
-    @pytest.mark.parametrize("seed", range(1, 7))
+    @pytest.mark.parametrize(
+        "seed", [1, 2, *(pytest.param(k, marks=pytest.mark.soak) for k in range(3, 7))]
+    )
     def test_response_is_known_to_20_ppm_and_2_mdeg_where_scans_move(self, seed):
         gain, phase = errors(identified(seed), TRUTH, np.array([0.5, 1.0, 1.5]))
         assert np.max(np.abs(gain)) < 20e-6
@@ -179,6 +181,7 @@ class TestOtherPlants:
         assert np.max(np.abs(gain)) < 5e-4
         assert np.max(np.abs(np.degrees(phase))) < 0.05
 
+    @pytest.mark.soak
     def test_a_lower_order_than_the_true_one_is_rejected(self):
         truth = resonance(60.0, 0.02)
         calibration = identify(record_of(recorded(plant=Plant(truth))), order=1).calibration

@@ -94,7 +94,9 @@ class TestImperfectData:
         _, phase = errors(calibration, TRUTH, np.array([1.0]))
         assert abs(np.degrees(phase[0])) < 2e-3
 
-    @pytest.mark.parametrize("start", [505, 530, 560])
+    @pytest.mark.parametrize(
+        "start", [505, *(pytest.param(k, marks=pytest.mark.soak) for k in (530, 560))]
+    )
     def test_a_record_that_starts_while_a_light_mode_rings_identifies_as_well(self, start):
         """The first edge is at 500: the axis is at rest or nearly so, the mode is not."""
         truth, frequency = resonance(60.0, 0.02), np.array([1.0, 15.0, 40.0])

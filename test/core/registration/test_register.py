@@ -150,6 +150,7 @@ def deviations_in_units(nominal, error, names, seeds, pose):
     return np.array(rows)
 
 
+@pytest.mark.soak
 def test_the_stated_uncertainty_is_the_scatter_on_a_part_without_errors():
     """It may be several times too large, for it is not known that the part has none."""
     off = deviations_in_units(

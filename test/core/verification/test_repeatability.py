@@ -62,6 +62,7 @@ def test_an_unchanged_twin_repeats_as_well_as_it_states():
     assert found.delay.mean == pytest.approx(Plant().dynamics.low_frequency_delay, abs=5e-6)
 
 
+@pytest.mark.soak
 def test_a_probe_whose_delay_wanders_does_not_repeat():
     wandering = [calibrated(seed, later=20e-6 * (seed % 2)) for seed in range(COUNT)]
     found = repeatability(wandering)
