@@ -140,6 +140,8 @@ def test_corrector_without_calibration_counts_and_waits(cell, true_calibration):
         lambda: (
             cell.operator.value("confocal_driver", "axes_subscribers") >= 1
             and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
+            # What is played before the driver has opened the port reaches nobody.
+            and cell.operator.value("confocal_driver", "connections") >= 1
         ),
     )
     assert cell.call(Trigger, "cell_emulator/step_test").success
