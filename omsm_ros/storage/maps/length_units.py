@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import shown
@@ -35,7 +35,7 @@ class LengthUnits:
 
     lateral: float
     height: float
-    where_unsaid: bool = False
+    where_unsaid: bool = field(default=False, compare=False)
 
 
 def metres_in(name: str) -> float | None:
