@@ -1,6 +1,7 @@
 """All benchmarks, one table, ``out/bench.json``: ``python -m benchmarks [--full] [part …]``.
 
 Without ``--full`` there are fewer runs of each study, so wider bars; each line says how many.
+Parts that judge results share the processors; those that take times follow, one after the other.
 
 Ends with exit status 1 if a bar is not cleared.
 """
@@ -8,36 +9,12 @@ Ends with exit status 1 if a bar is not cleared.
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
-import os
 import sys
-import time
 from pathlib import Path
 
+from benchmarks.parts import PARTS, measured
 from benchmarks.row import Row
-
-PARTS = (
-    *(
-        "identification",
-        "disturbed",
-        "free_path",
-        "correction",
-        "honesty",
-        "speed",
-        "offline",
-        "live",
-        "devices",
-        "real_data",
-        "selfcal",
-        "spectra",
-        "form",
-        "budget",
-    ),
-    "twin",
-    "campaign",
-    "viewer",
-)
 
 
 def show(row: Row) -> None:
@@ -52,12 +29,6 @@ def show(row: Row) -> None:
     )
 
 
-def _processor_time() -> float:
-    """Seconds that this process and those it waited for have taken."""
-    took = os.times()
-    return took.user + took.system + took.children_user + took.children_system
-
-
 def main() -> int:
     """Run the parts asked for, all by default."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -70,13 +41,11 @@ def main() -> int:
         parser.error(f"no part {unknown}, expected {', '.join(PARTS)}")
     found: list[Row] = []
     print(f"{'':6}{'figure':72}{'runs':>5}{'value':>12} {'':6}{'bar':16}peer")
-    for part in args.parts:
-        begin, used = time.monotonic(), _processor_time()
-        for row in importlib.import_module(f"benchmarks.{part}").rows(args.full):
-            found.append(row)
+    for part, rows, wall, processor in measured(args.parts, args.full):
+        for row in rows:
             show(row)
-        wall, cpu = time.monotonic() - begin, _processor_time() - used
-        print(f"      {part}: {wall:.0f} s, {cpu:.0f} s of processor time", flush=True)
+        found += rows
+        print(f"      {part}: {wall:.0f} s, {processor:.0f} s of processor time", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     # JSON has no NaN: what could not be had is null.
     plain = [{k: None if v != v else v for k, v in row.items()} for row in found]

@@ -1,4 +1,4 @@
-"""How accurate, how honest and how fast is the identification? Each study returns rows.
+"""How accurate and how honest is the identification? Each study returns rows.
 
 All on the twin, whose truth is known: the default step test at 1 kHz, 10 nm of noise and
 10 nm of resolution, unless a row says otherwise.
@@ -6,7 +6,6 @@ All on the twin, whose truth is known: the default step test at 1 kHz, 10 nm of 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -16,17 +15,11 @@ from scipy import signal
 from benchmarks.against_truth import (
     band_held,
     coverage,
-    inside,
-    mass_errors,
-    mode_errors,
-    over_stated,
     rejected,
-    worst,
 )
 from benchmarks.cramer_rao import response_bounds
-from benchmarks.row import Row, at_least, at_most, between, shown
+from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.fitting.covariance import hidden_motion_covariance
@@ -53,8 +46,6 @@ def rows(full: bool) -> Iterator[Row]:
     yield from accuracy(200 if full else 30)
     yield from coloured(100 if full else 10)
     yield from sharp_edges(10 if full else 3)
-    yield from other_plants(20 if full else 3)
-    yield from speed()
 
 
 def record_once(
@@ -131,7 +122,8 @@ def _log_ratio(calibration: Calibration, truth: TransferFunction) -> ComplexArra
     return np.asarray(np.log(ratio))
 
 
-def _rms(values: FloatArray | ComplexArray) -> FloatArray:
+def rms(values: FloatArray | ComplexArray) -> FloatArray:
+    """Root mean square over the runs, the first axis."""
     return np.asarray(np.sqrt(np.mean(np.abs(values) ** 2, axis=0)))
 
 
@@ -152,14 +144,14 @@ def accuracy(runs: int) -> list[Row]:
     found = monte_carlo(seeds(runs), record_once, Plant().dynamics)
     gain, phase = found.error.real, found.error.imag
     gain_bound, phase_bound = bounds()
-    both = _rms(found.error) / np.hypot(gain_bound, phase_bound)
+    both = rms(found.error) / np.hypot(gain_bound, phase_bound)
     table = [found.rejections("default step test")]
     for k, f in enumerate(FREQUENCIES):
         name = f"rms error of G at {f:g} Hz over Cramér-Rao bound of the true structure"
         # An rms of n runs scatters by 1/√(2n), relative; twice that above 1.1.
         table.append(at_most(name, both[k], "", round(1.1 + 2 / np.sqrt(2 * runs), 2), runs=runs))
         for what, error, bound in (("gain", gain, gain_bound), ("phase", phase, phase_bound)):
-            own, bias = (float(v / bound[k]) for v in (_rms(error)[k], abs(np.mean(error[:, k]))))
+            own, bias = (float(v / bound[k]) for v in (rms(error)[k], abs(np.mean(error[:, k]))))
             # The bar is on both together.
             table.append(shown(f"of which {what} at {f:g} Hz", own, "", "alone", runs))
             table.append(at_most(f"{what} bias at {f:g} Hz over the bound", bias, "", 1, runs=runs))
@@ -172,7 +164,7 @@ def accuracy(runs: int) -> list[Row]:
         *found.coverage(),
         at_least(within, 100 * np.mean(near), "%", 99, runs=runs),
         shown("worst phase error at 1 Hz", worst, "mdeg", runs=runs),
-        at_most("static gain rms", 1e6 * float(_rms(found.static_gain)), "ppm", 10, runs=runs),
+        at_most("static gain rms", 1e6 * float(rms(found.static_gain)), "ppm", 10, runs=runs),
     ]
 
 
@@ -228,87 +220,6 @@ def sharp_edges(runs: int) -> list[Row]:
     return table
 
 
-def other_plants(runs: int) -> list[Row]:
-    """What is read off other plants, and whether the truth is as near as it is said to be."""
-    omega = 2 * np.pi * 60
-    mode = TransferFunction.from_ascending([1.0], [1.0, 0.04 / omega, omega**-2])
-    late = TransferFunction(np.ones(1), np.ones(1), 0.7e-3)
-    first_order = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
-    lone, delayed = identified(mode, runs), identified(late, runs)
-    fast = [identify(record_once(s, StepTest(rise=0.0), period=1e-4)).calibration for s in seeds(3)]
-    frequency, damping = mode_errors(lone, mode, 0)
-    pair, pair_damping = mode_errors(fast, Plant().dynamics, 0)
-    off = [c.dynamics.low_frequency_delay - late.delay for c in delayed]
-    stated = [c.certificate["low_frequency_delay_uncertainty_s"] for c in delayed]
-    table = [
-        at_most("frequency of a lone 60 Hz mode", 100 * worst(frequency), "%", 0.1, runs=runs),
-        at_most("its damping of 2 %", 100 * worst(damping), "%", 5, runs=runs),
-        at_most("a delay of 0.7 ms", 1e6 * float(np.max(np.abs(off))), "us", 5, runs=runs),
-        at_most("pole pair of Eq. 12 at 10 kHz", 100 * worst(pair), "%", 1, runs=3),
-        at_most("its damping", 100 * worst(pair_damping), "%", 5, runs=3),
-        inside("frequency of a lone 60 Hz mode", lone, *frequency),
-        inside("damping of a lone 60 Hz mode", lone, *damping),
-        inside("delay of 0.7 ms", delayed, np.array(off), np.array(stated)),
-        at_most("pole pair of Eq. 12, error over stated", over_stated(pair), "", 3, runs=3),
-    ]
-    for order, truth, name in (
-        (3, first_order, "first order as third"),
-        (1, mode, "60 Hz mode as first order"),
-        (2, MACHINE.non_collocated(), "two masses as second order"),
-        (1, Plant().dynamics, "Eq. 12 as first order"),
-    ):
-        table += band_held(name, identified(truth, 3 * runs, order), truth)
-    return [*table, *two_masses(2 * runs)]
-
-
-MACHINE = TwoMass(m1=10.0, m2=2.0, k1=2e6, k2=4e5, c1=450.0, c2=60.0)
-
-
-def two_masses(runs: int) -> list[Row]:
-    """Modes, and masses, springs and dampers: scatter over repeated recordings over stated."""
-    table = []
-    for name in ("non-collocated", "collocated"):
-        truth = MACHINE.collocated() if name == "collocated" else MACHINE.non_collocated()
-        found = identified(truth, runs)
-        for index, mode in enumerate(truth.modes()):
-            what = f"frequency of {mode.frequency:.0f} Hz mode, {name}"
-            table.append(inside(what, found, *mode_errors(found, truth, index)[0]))
-        errors = mass_errors(found, MACHINE, collocated=name == "collocated")
-        recognised = 100 * len(errors) / runs
-        table.append(at_least(f"recognised as {name}", recognised, "%", 95, runs=runs))
-        # An rms of n runs scatters by 1/√(2n), relative.
-        off = 2 / np.sqrt(2 * max(len(errors), 1)) + 0.1
-        low, high = round(1 - off, 2), round(1 + off, 2)
-        table += [
-            between(f"rms error over stated, {part}, {name}", ratio, "", low, high, runs=runs)
-            for part, ratio in zip(FITTED, _rms(errors), strict=True)
-        ]
-    return table
-
-
 def seeds(runs: int) -> range:
     """Those of one study."""
     return range(FIRST_SEED, FIRST_SEED + runs)
-
-
-def identified(truth: TransferFunction, runs: int, order: int = 0) -> list[Calibration]:
-    """Of one recording a seed."""
-    return [
-        identify(record_once(s, plant=Plant(truth)), order=order).calibration for s in seeds(runs)
-    ]
-
-
-def speed() -> list[Row]:
-    """Processor time of one identification, and how it grows with the data."""
-    short, long = record_once(1), record_once(1, StepTest(dwell=5.0))
-    once, tenfold = (min(_seconds(r) for _ in range(3)) for r in (short, long))
-    return [
-        at_most("identification of 20 steps at 1 kHz, processor time", once, "s", 2.0),
-        at_most("time for ten times the data", tenfold / once, "x", 12.0),
-    ]
-
-
-def _seconds(recorded: MotionRecord) -> float:
-    begin = time.process_time()
-    identify(recorded)
-    return time.process_time() - begin

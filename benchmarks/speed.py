@@ -1,4 +1,4 @@
-"""How fast are the correction in memory and the choice of an order, and against their peers?
+"""How fast are correction, identification and the choice of an order, and against their peers?
 
 PyDynamic is the peer for propagating uncertainty through a recursive filter; it is optional,
 and needs NumPy below 2.4.
@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from time import process_time
 
 import numpy as np
 from scipy import signal
 
 from benchmarks.correction import SOURCES, corrected, identified_calibration
+from benchmarks.identification import record_once
 from benchmarks.row import Row, at_least, at_most, not_compared
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -23,6 +25,8 @@ from omsm_ros.core.fitting.free_run_choice import MAX_ORDER, choose_sampled
 from omsm_ros.core.fitting.held_problem import DiscreteScaled, HeldProblem
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import fit
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.twin.cell import Recording, blocks_of
 
@@ -74,7 +78,17 @@ def rows(full: bool) -> list[Row]:
         table.append(not_compared(name, "1", ">= 25", "needs PyDynamic and NumPy below 2.4"))
     else:
         table.append(at_least(name, peer * PAPER_POINTS / whole, "1", 25.0, "PyDynamic"))
-    return table
+    return [*table, *_identification()]
+
+
+def _identification() -> list[Row]:
+    """Processor time of one identification, and how it grows with the data."""
+    short, long = record_once(1), record_once(1, StepTest(dwell=5.0))
+    once, tenfold = (_seconds(partial(identify, r), 3) for r in (short, long))
+    return [
+        at_most("identification of 20 steps at 1 kHz, processor time", once, "s", 2.0),
+        at_most("time for ten times the data", tenfold / once, "x", 12.0),
+    ]
 
 
 def _choice_factor() -> tuple[float, str, float, str]:

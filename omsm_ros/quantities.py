@@ -136,6 +136,7 @@ DISTANCE = Quantity("distance", "m", -100.0, 100.0, "give it in metres")
 # A spindle's angle is counted on over its turns: a year at 30 rpm makes 1e8 rad.
 ANGLE = Quantity("angle", "rad", -1e9, 1e9, "give it in radians")
 ACCELERATION = Quantity("acceleration", "m/s²", -1e6, 1e6, "give it in m/s²")
+TEMPERATURE = Quantity("temperature", "°C", -100.0, 200.0, "give it in degrees Celsius")
 TIME = Quantity("time", "s", -1e10, 1e10, "give it in seconds")
 # A minute at 20 kHz waits in a quarter of a gigabyte.
 WAIT = Quantity("waiting time", "s", 1e-3, 60.0, "give it in seconds")

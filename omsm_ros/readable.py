@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from datetime import datetime, timezone
 
+from omsm_ros.units import DAY_S, NANOSECONDS_PER_S
+
 NOTHING = "–"
 # Nothing smaller than nano: lengths below it are read as 0.31 nm.
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-_WITHOUT_PREFIX = {"", "%", "°", "ppm", "kg", "rpm"}
+_WITHOUT_PREFIX = {"", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
 # A value far smaller than its uncertainty, or far larger, gets no absurd row of digits.
 _MOST_DECIMALS = 9
 _FIGURES = {
@@ -158,6 +160,20 @@ def _fixed(rounded: float, digits: int, exponent: int) -> str:
     return f"{rounded / 10.0**exponent:.{decimals}f}"
 
 
+def days(seconds: object) -> str:
+    """Return a time in days, "0.12 d"; what is no number gives a dash."""
+    known = number(seconds)
+    return NOTHING if known is None else quantity(known / DAY_S, "d", 2)
+
+
 def moment(when: datetime) -> str:
     """Return a date and time for a page, "2026-01-31 23:59 UTC"; ``when`` knows its time zone."""
     return when.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def moment_of(stamp_ns: object) -> str:
+    """Return a ROS time [ns] as :func:`moment` does; what is no number gives a dash."""
+    known = number(stamp_ns)
+    if known is None:
+        return NOTHING
+    return moment(datetime.fromtimestamp(known / NANOSECONDS_PER_S, tz=timezone.utc))

@@ -23,7 +23,7 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.sampled.identify_samples import HOLDS
 from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
+from omsm_ros.jobs.identify_bag import motion_of_bag, recorded_ns_of_bag, settings_of_bag
 from omsm_ros.jobs.identify_table import (
     SampledRecord,
     model_of,
@@ -103,8 +103,14 @@ def _identify(args: argparse.Namespace) -> Facts:
         )
     if args.hold != BAND_LIMITED:
         return _model_facts(record_of_motion(motion), args)
-    settings = settings_of_bag(cell_of(args.recording, args), args.settings or {})
-    identified = identify(motion, order=args.order, input=args.input, settings=settings)
+    bag = cell_of(args.recording, args)
+    identified = identify(
+        motion,
+        order=args.order,
+        input=args.input,
+        settings=settings_of_bag(bag, args.settings or {}),
+        recorded_ns=recorded_ns_of_bag(bag),
+    )
     facts = calibration_facts(identified.calibration)
     path = kept_at(args.out, facts["verdict"])
     save_calibration(path, identified.calibration)

@@ -12,8 +12,8 @@ from omsm_ros.cli.command import Command, Facts, table
 from omsm_ros.core.verification.trend import Trend
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.storage.strict_json import unknown_as_null
+from omsm_ros.units import DAY_S
 
-_DAY_S = 86_400.0
 _SHOWN_ROWS = 20
 
 
@@ -90,7 +90,7 @@ def _drift(found: dict[str, float] | None, unit: str) -> str:
         return f"{NOTHING} (not evaluated: fewer than five, or no times)"
     drift = Trend(**found)
     low, high = (
-        quantity(s * _DAY_S, unit) if unit else plain(s * _DAY_S) for s in (drift.low, drift.high)
+        quantity(s * DAY_S, unit) if unit else plain(s * DAY_S) for s in (drift.low, drift.high)
     )
     return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
 

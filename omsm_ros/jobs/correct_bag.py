@@ -19,7 +19,7 @@ from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.scan_path import PathStart, ScanPath
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
@@ -45,6 +45,8 @@ class Correction:
     largest_uncertainty: [m];  points: evenly chosen, as in the cloud
     trace: points that stand for the scan where its systematic errors are judged
     path: its start, None without axes
+    recorded_ns: when the recording began [ns, ROS time], None where nobody knows
+    temperatures: that were recorded (n,) [°C], in their order; NaN: cannot be
     sample_period: [s];  faults: what counters and stamps of the recording say against it
     """
 
@@ -59,6 +61,8 @@ class Correction:
     trace: ScanTrace
     path: ScanPath | None
     sample_period: float
+    recorded_ns: int | None
+    temperatures: FloatArray
     faults: tuple[str, ...] = ()
 
 
@@ -178,5 +182,7 @@ def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
         trace=scan.trace,
         path=found.path.path(),
         sample_period=scan.sample_period,
+        recorded_ns=scan.recorded_ns,
+        temperatures=scan.temperatures,
         faults=found.faults(scan),
     )

@@ -56,6 +56,8 @@ class CorrectedScan:
     """A bag opened and its surface points as they are corrected; use it as a context manager.
 
     sample_period: of the scan [s];  admitted, reasons: the decision to use the calibration
+    recorded_ns: when the recording began [ns, ROS time], None where nobody knows
+    temperatures: that were recorded (n,) [°C], in their order; NaN: cannot be
     by_stamps: join the streams by their stamps, for which all samples are held in memory;
         None: by the trigger counter they share, in bounded memory
 
@@ -87,6 +89,7 @@ class CorrectedScan:
                 raise BagError(f"{str(self.path)!r} has no samples on {TOPICS}; record a scan")
             self.sample_period = float(first.sample_period)
             self._rest = chain([first], blocks)
+            self.recorded_ns, self.temperatures = bag.recorded_ns, bag.temperatures()
             self.reasons = objections(
                 self._calibration,
                 sample_period=self.sample_period,

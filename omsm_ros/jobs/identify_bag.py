@@ -60,6 +60,12 @@ def settings_of_bag(path: AnyBag, stated: Mapping[str, object]) -> dict[str, obj
         return settings_with(stated, bag.probe_settings())
 
 
+def recorded_ns_of_bag(path: AnyBag) -> int | None:
+    """Return when the recording began [ns, ROS time], None where its clock was never set."""
+    with bags.BagReader(path) as bag:
+        return bag.recorded_ns
+
+
 def _beginning(blocks: list[Block], duration: float) -> list[Block]:
     if duration == 0 or not blocks:
         return blocks

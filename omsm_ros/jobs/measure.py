@@ -16,17 +16,19 @@ from omsm_ros.core.correction.calibration_set import CalibrationSet
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources
 from omsm_ros.core.correction.predict import predict_error
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration import Calibration, age_at
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
 from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.judge_scan import Judgement, with_sources
 from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, save_json
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -145,6 +147,7 @@ def summarise(
         "samples": done.account,
         "uncertainty_budget": done.budget,
         "stamp_skew": done.stamp_skew,
+        "conditions": conditions(done, calibration),
         "settings": dict(calibration.settings),
         "latency": latency_of(calibration).entry(),
         "versions": {
@@ -154,7 +157,10 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY},
         "admission": done.admission,
-        "warnings": [f"overridden: {reason}" for reason in done.reasons],
+        "warnings": [
+            *(f"overridden: {reason}" for reason in done.reasons),
+            *_implausible(done.temperatures),
+        ],
     }
     if not done.statistics:
         summary["warnings"] += [*done.faults, "not one sample could be corrected; see the reasons"]
@@ -163,6 +169,35 @@ def summarise(
     summary["warnings"] += judged.pop("warnings")
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
+
+
+def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
+    """Return when a scan was made, how old its calibration was then [s], and how warm it was [°C].
+
+    Each is None where nobody recorded it.
+    """
+    told = done.temperatures[np.isfinite(done.temperatures)]
+    return {
+        "recorded_ns": done.recorded_ns,
+        "calibration_age": age_at(calibration, done.recorded_ns),
+        "temperature": None
+        if not len(told)
+        else {
+            "mean": float(np.mean(told)),
+            "lowest": float(np.min(told)),
+            "highest": float(np.max(told)),
+            "change": float(told[-1] - told[0]),
+        },
+    }
+
+
+def _implausible(temperatures: FloatArray) -> list[str]:
+    lost = int(np.sum(~np.isfinite(temperatures)))
+    said = (
+        f"{lost} of {len(temperatures)} temperatures cannot be, expected "
+        f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
+    )
+    return [said] * bool(lost)
 
 
 def _places(calibration: Calibration) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
-from omsm_ros.jobs.identify_bag import motion_of_bag, settings_of_bag
+from omsm_ros.jobs.identify_bag import motion_of_bag, recorded_ns_of_bag, settings_of_bag
 from omsm_ros.jobs.remember import remembered
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
@@ -212,9 +212,13 @@ class CalibratorNode(ManagedNode):
         stated, source = self._settings, request.input or "encoder"
         if request.bag:
             settings = partial(settings_of_bag, Path(request.bag), stated)
+            recorded = partial(recorded_ns_of_bag, Path(request.bag))
         else:
             settings = partial(settings_with, stated, [self._probe])
-        return lambda: identify(motion(), order=order, input=source, settings=settings())
+            recorded = partial(int, self.get_clock().now().nanoseconds)
+        return lambda: identify(
+            motion(), order=order, input=source, settings=settings(), recorded_ns=recorded()
+        )
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
         return motion_of_bag(

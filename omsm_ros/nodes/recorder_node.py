@@ -11,7 +11,7 @@ from pathlib import Path
 from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
 from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import PointCloud2, Temperature
 from std_msgs.msg import String
 
 from omsm_ros.errors import BagError, ConfigurationError
@@ -36,6 +36,7 @@ _TOPICS = {
     topics.POINTS_TOPIC: PointCloud2,
     topics.PROBE_TOPIC: String,
     topics.VIBRATION_TOPIC: String,
+    topics.TEMPERATURE_TOPIC: Temperature,
 }
 
 _FLUSH_PERIOD_S = 0.5

@@ -14,10 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
 
+import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.storage import conversions
 from omsm_ros.storage.bag_checks import (
@@ -40,6 +41,7 @@ from omsm_ros.storage.recording.topics import (
     POINTS_TOPIC,
     PROBE_TOPIC,
     REFERENCE_TOPIC,
+    TEMPERATURE_TOPIC,
     TOPIC_TYPES,
     VIBRATION_TOPIC,
     AnyBag,
@@ -56,6 +58,7 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     POINTS_TOPIC: conversions.cloud_array,
     PROBE_TOPIC: conversions.probe_settings,
     VIBRATION_TOPIC: vibration_levels,
+    TEMPERATURE_TOPIC: conversions.temperature,
 }
 
 _BLOCKS: dict[str, type] = {
@@ -207,6 +210,12 @@ class BagReader:
         if not self.count([VIBRATION_TOPIC]):
             return []
         return [told for _, told in self.records(VIBRATION_TOPIC)]
+
+    def temperatures(self) -> FloatArray:
+        """Return the readings of the temperature (n,) [°C], in their order; NaN: cannot be."""
+        if not self.count([TEMPERATURE_TOPIC]):
+            return np.empty(0)
+        return np.array([value for _, value in self.records(TEMPERATURE_TOPIC)])
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
         """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.

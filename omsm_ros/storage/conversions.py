@@ -21,6 +21,7 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import CalibrationError, DataError
+from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import calibration_of
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -134,6 +135,11 @@ def calibration(message: Any) -> Calibration:
 def probe_settings(message: Any) -> dict[str, object]:
     """Return what a probe's driver reported, a JSON object in a ``std_msgs/String``."""
     return _json_object("probe_settings", message.data)
+
+
+def temperature(message: Any) -> float:
+    """Return a reading of a ``sensor_msgs/Temperature`` [°C], NaN for one that cannot be."""
+    return float(TEMPERATURE.or_lost(np.array([message.temperature]))[0])
 
 
 def _json_object(name: str, text: str) -> dict[str, object]:

@@ -22,6 +22,9 @@ _OF_ROS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
     "std_msgs/msg/String": "string data\n",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "sensor_msgs/msg/Temperature": (
+        "std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n"
+    ),
     "sensor_msgs/msg/PointField": (
         "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\n"
         "uint8 UINT32=6\nuint8 FLOAT32=7\nuint8 FLOAT64=8\n"

@@ -17,12 +17,16 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, OmsmError
 from omsm_ros.quantities import FREQUENCY, GAIN, SAMPLE_PERIOD
+from omsm_ros.units import NANOSECONDS_PER_S
 
 SCHEMA = "omsm-calibration/1"
 REJECTED, ACCEPTED = "rejected", "accepted"
 RESERVED = "accepted with reservations"
 # A difference of two covariances this little indefinite, of correlations, is rounding.
 _ROUNDING = 1e-9
+
+RECORDED = "recorded_ns"
+"""Entry of a certificate: when its recording began [ns, ROS time], None where nobody knows."""
 
 PROBE = "probe."
 """Begins the names of settings that the probe's driver reports by itself."""
@@ -156,6 +160,17 @@ class Calibration:
     def id(self) -> str:
         """SHA-256 over the canonical content, hexadecimal."""
         return content_id(self.content())
+
+
+def age_at(calibration: Calibration, moment_ns: int | None) -> float | None:
+    """Return how long before ``moment_ns`` [ns, ROS time] a calibration was recorded [s].
+
+    None where nobody knows when either was; negative for one that is newer.
+    """
+    recorded = calibration.certificate.get(RECORDED)
+    if moment_ns is None or type(recorded) is not int:
+        return None
+    return (moment_ns - recorded) / NANOSECONDS_PER_S
 
 
 def verdict_of(calibration: Calibration) -> tuple[str, list[str]]:

@@ -23,7 +23,7 @@ from typing import ParamSpec
 import numpy as np
 
 from omsm_ros.core.departures.families import DRIFT
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.dynamics.calibration import RECORDED, Calibration
 from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
@@ -85,6 +85,7 @@ def identify(
     order: int = 0,
     input: str = "encoder",
     settings: Mapping[str, object] | None = None,
+    recorded_ns: int | None = None,
 ) -> Identification:
     """Return the calibration that ``record`` supports, with the fit behind it.
 
@@ -93,6 +94,7 @@ def identify(
     input: "encoder", or "reference" to take the second sensor as the motion
     settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the masses
         and springs of a response that is that of two masses are in SI, else per table mass
+    recorded_ns: when the recording began [ns, ROS time], None where nobody knows
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
     did not see it, ConfigurationError for an input or a mass that cannot be. A model that can
@@ -115,7 +117,7 @@ def identify(
         known = no_surer(known, prepared, model, model.free, limits)
     evidence = Evidence(record, prepared, model, known, limits, searched)
     findings = _findings(evidence)
-    best = model.chosen.fit
+    best, origin = model.chosen.fit, {"input": input, RECORDED: recorded_ns}
     calibration = Calibration(
         dynamics=best.dynamics,
         static_gain=abs(best.gain),
@@ -123,7 +125,7 @@ def identify(
         valid_up_to=max(known.valid_up_to, _TRUSTED_NOWHERE_HZ),
         covariance=known.covariance,
         settings=dict(settings or {}),
-        certificate={"input": input} | certificate_of(evidence, findings, mass),
+        certificate=origin | certificate_of(evidence, findings, mass),
     )
     return Identification(calibration, prepared, best)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -12,30 +11,46 @@ import numpy as np
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.verification.trend import FEWEST, Trend, outliers, trend
-from omsm_ros.readable import NOTHING, count, percent, quantity
+from omsm_ros.readable import NOTHING, count, days, moment_of, percent, quantity
 from omsm_ros.report.common import style
 from omsm_ros.report.common.tables import part
 from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
-from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
-
-_DAY_S = 86_400.0
+from omsm_ros.units import DAY_S, NANOMETRE_M, NANOSECONDS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A number that each measurement has: its name, and where its summary holds it [m]."""
+    """A number that each measurement has.
+
+    place: where its summary holds it;  unit: of it;  judged: whether it may stand out and drift
+    """
 
     name: str
     place: tuple[str, ...]
+    unit: str = "m"
+    judged: bool = True
+
+    @property
+    def drawn(self) -> tuple[float, str]:
+        """What one unit on the picture is in the unit of the summary, and its name."""
+        return {"m": (NANOMETRE_M, "nm"), "s": (DAY_S, "d")}.get(self.unit, (1.0, self.unit))
+
+    def told(self, value: float) -> str:
+        """Return a value as text."""
+        return days(value) if self.unit == "s" else quantity(value, self.unit)
 
 
+TEMPERATURE = Series("Temperature", ("conditions", "temperature", "mean"), "°C")
 SERIES = (
     Series("Deviation from nominal, rms by area", ("deviation", "corrected", "rms_area_weighted")),
     Series("Deviation, peak to valley", ("deviation", "corrected", "peak_to_valley")),
     Series("Dynamic error removed, rms", ("dynamic_error_before", "rms")),
     Series("Standard uncertainty, median", ("uncertainty", "median")),
     Series("Scatter beyond what is stated, rms", ("uncertainty_budget", "scan_scatter")),
+    TEMPERATURE,
+    # It grows by a day a day.
+    Series("Age of the calibration", ("conditions", "calibration_age"), "s", judged=False),
 )
 
 
@@ -71,7 +86,7 @@ def render(title: str, measurements: Sequence[Measurement], calibration: Calibra
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A series over all measurements: values (n,) [m], which stand out (n,), how it drifts."""
+    """A series over all measurements: values (n,), which stand out (n,), how it drifts."""
 
     series: Series
     values: FloatArray
@@ -86,7 +101,8 @@ def judge(measurements: Sequence[Measurement]) -> list[Judged]:
     for series in SERIES:
         values = np.array([_value(m, series) for m in measurements])
         if np.any(np.isfinite(values)):
-            found.append(Judged(series, values, outliers(values), trend(times, values)))
+            drift = trend(times, values) if series.judged else None
+            found.append(Judged(series, values, outliers(values) & series.judged, drift))
     return found
 
 
@@ -95,17 +111,35 @@ def remarks(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> li
     found = [f"{m.name}: {m.state}, {m.said}" for m in measurements if m.state != "done"]
     for one in judged:
         for i in np.flatnonzero(one.outlying):
-            usual = quantity(float(np.nanmedian(one.values)), "m")
-            value = quantity(float(one.values[i]), "m")
+            usual = one.series.told(float(np.nanmedian(one.values)))
+            value = one.series.told(float(one.values[i]))
             found.append(
                 f"{measurements[i].name} stands out: {_low(one.series.name)} is {value}, where "
                 f"{usual} is usual"
             )
         if one.drift is not None and one.drift.significant:
-            low, high = (quantity(s * _DAY_S, "m") for s in (one.drift.low, one.drift.high))
+            unit = "K" if one.series is TEMPERATURE else one.series.unit
+            low, high = (quantity(s * DAY_S, unit) for s in (one.drift.low, one.drift.high))
             found.append(f"{one.series.name} drifts by {low} to {high} a day (95 %)")
+    found += _with_temperature(judged)
     if sum(m.state == "done" for m in measurements) < FEWEST:
         found.append(f"outliers and drift: not evaluated, of fewer than {FEWEST} measurements")
+    return found
+
+
+def _with_temperature(judged: Sequence[Judged]) -> list[str]:
+    """Say which figures go with the temperature, each in a sentence."""
+    warm = [one.values for one in judged if one.series is TEMPERATURE]
+    found = []
+    for one in judged:
+        if not warm or one.series is TEMPERATURE or not one.series.judged:
+            continue
+        slope = trend(warm[0], one.values)
+        if slope is not None and slope.significant:
+            low, high = (quantity(s, one.series.unit) for s in (slope.low, slope.high))
+            found.append(
+                f"{one.series.name} goes with the temperature, {low} to {high} a kelvin (95 %)"
+            )
     return found
 
 
@@ -141,7 +175,7 @@ def _row(
     cells = []
     for series in SERIES:
         one = known.get(series)
-        text = NOTHING if one is None else quantity(float(one.values[place]), "m")
+        text = NOTHING if one is None else series.told(float(one.values[place]))
         cells.append((text, one is not None and bool(one.outlying[place])))
     verdict = None
     if measurement.state == "done":
@@ -151,7 +185,7 @@ def _row(
     return {
         "name": measurement.name,
         "link": measurement.link,
-        "when": _date(measurement.recorded_ns),
+        "when": moment_of(measurement.recorded_ns),
         "verdict": verdict,
         "said": measurement.said,
         "state": measurement.state,
@@ -161,27 +195,25 @@ def _row(
     }
 
 
-def _date(stamp_ns: int | None) -> str:
-    if stamp_ns is None:
-        return NOTHING
-    when = datetime.fromtimestamp(stamp_ns / NANOSECONDS_PER_S, tz=timezone.utc)
-    return f"{when:%Y-%m-%d %H:%M}"
-
-
 def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> bytes:
     """Return each series over time, or over the order of names where no time is known."""
     times = _times(measurements)
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
-    x = (times - np.nanmin(times)) / _DAY_S if timed else np.arange(len(measurements))
+    x = (times - np.nanmin(times)) / DAY_S if timed else np.arange(len(measurements))
     made, axes = style.figure(10.0, 2.1 * len(judged) + 0.5, rows=len(judged), sharex=True)
     for one, panel in zip(judged, axes[:, 0], strict=True):
         usual = ~one.outlying
-        panel.plot(x[usual], one.values[usual] / NANOMETRE_M, ".", color=style.AFTER, markersize=5)
-        panel.plot(x[one.outlying], one.values[one.outlying] / NANOMETRE_M, "o", color=style.BEFORE)
-        # A twentieth more than the largest, so that its dot is whole.
-        panel.set_ylim(0, 1.05 * (float(np.nanmax(one.values)) / NANOMETRE_M or 1.0))
+        per_unit, unit = one.series.drawn
+        values = one.values / per_unit
+        panel.plot(x[usual], values[usual], ".", color=style.AFTER, markersize=5)
+        panel.plot(x[one.outlying], values[one.outlying], "o", color=style.BEFORE)
+        if one.series is not TEMPERATURE:
+            # A twentieth more than the largest, so that its dot is whole.
+            panel.set_ylim(
+                min(0.0, float(np.nanmin(values))), 1.05 * (float(np.nanmax(values)) or 1.0)
+            )
         if not timed:
             panel.xaxis.get_major_locator().set_params(integer=True)
-        style.label(panel, y="nm", title=one.series.name)
+        style.label(panel, y=unit, title=one.series.name)
     style.label(axes[-1, 0], x="days since the first recording" if timed else "measurement")
     return style.png(made, dpi=120)

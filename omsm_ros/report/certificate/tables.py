@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import SCHEMA, Calibration
+from omsm_ros.core.dynamics.calibration import RECORDED, SCHEMA, Calibration
 from omsm_ros.readable import (
     NOTHING,
     count,
     measured,
+    moment_of,
     number,
     plain,
     probability,
@@ -38,7 +39,7 @@ _SHOWN = {
     "valid_from", "departures", "could_hide", "hidden_mostly", "plateau_s", "assumed",
     "motion_error_m", "reservations", "timing_scatter_s",
     "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
-    "reference_lag_uncertainty_s", "latency", "consistency",
+    "reference_lag_uncertainty_s", "latency", "consistency", RECORDED,
 }  # fmt: skip
 
 CertificateEntries = Mapping[str, Any]
@@ -301,6 +302,7 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
         ("identity", calibration.id),
         ("schema", SCHEMA),
         ("recording", source or NOTHING),
+        ("recorded", moment_of(calibration.certificate.get(RECORDED))),
         ("sample period", quantity(calibration.sample_period, "s", 4)),
         ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
         ("omsm_ros", version or NOTHING),

@@ -6,7 +6,16 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from omsm_ros.readable import NOTHING, expanded, figure, measured, plain, quantity
+from omsm_ros.readable import (
+    NOTHING,
+    days,
+    expanded,
+    figure,
+    measured,
+    moment_of,
+    plain,
+    quantity,
+)
 from omsm_ros.report.common.tables import Table, part
 from omsm_ros.report.common.verdict import Verdict
 from omsm_ros.units import MILLIMETRE_M
@@ -185,12 +194,22 @@ def _size_of(value: Any, unit: str) -> str:
     return quantity(value, unit) if unit else plain(value)
 
 
+def _temperature(told: Mapping[str, Any]) -> str:
+    if not told:
+        return NOTHING
+    mean, change = quantity(told.get("mean"), "°C", 4), quantity(told.get("change"), "K", 2, True)
+    return f"{mean}, {change} from the beginning to the end"
+
+
 def provenance_table(summary: Mapping[str, Any]) -> Table:
     """Return from which recording and by which calibration a result is."""
     admission = part(summary, "admission")
     rows = [
         ("recording", str(part(summary, "bag") or NOTHING)),
+        ("recorded", moment_of(part(summary, "conditions", "recorded_ns"))),
+        ("temperature", _temperature(part(summary, "conditions", "temperature") or {})),
         ("calibration", str(part(summary, "calibration") or NOTHING)),
+        ("its age then", days(part(summary, "conditions", "calibration_age"))),
         ("overridden", "yes" if part(admission or {}, "overridden") else "no"),
         ("files", ", ".join(map(str, (part(summary, "files") or {}).values())) or NOTHING),
     ]

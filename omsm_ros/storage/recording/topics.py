@@ -18,6 +18,7 @@ CALIBRATION_TOPIC = "/omsm/calibration"
 POINTS_TOPIC = "/omsm/points"
 PROBE_TOPIC = "/omsm/probe_settings"
 VIBRATION_TOPIC = "/omsm/vibration"
+TEMPERATURE_TOPIC = "/omsm/temperature"
 
 TOPIC_TYPES = {
     AXES_TOPIC: "omsm_msgs/msg/AxisBlock",
@@ -28,6 +29,7 @@ TOPIC_TYPES = {
     POINTS_TOPIC: "sensor_msgs/msg/PointCloud2",
     PROBE_TOPIC: "std_msgs/msg/String",
     VIBRATION_TOPIC: "std_msgs/msg/String",
+    TEMPERATURE_TOPIC: "sensor_msgs/msg/Temperature",
 }
 
 LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC, PROBE_TOPIC})

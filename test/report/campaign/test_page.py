@@ -38,6 +38,18 @@ def test_outliers_and_drift_are_named_with_their_size(drifting):
     assert not any("ncertainty" in t for t in told)
 
 
+def test_what_goes_with_the_temperature_is_told_with_its_size():
+    """2 nm a kelvin, over a fortnight that gets neither warmer nor older; all at one age."""
+    random = np.random.default_rng(2)
+    warm = 20.0 + random.normal(0, 0.5, 14)
+    told = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]
+    for one, t in zip(told, warm, strict=True):
+        one.summary["conditions"] = {"temperature": {"mean": t}, "calibration_age": 86400.0}
+    (said,) = [t for t in remarks(told, judge(told)) if "rms by area goes" in t]
+    assert "temperature, 2.00 nm to 2.00 nm a kelvin" in said
+    assert not any("Age" in t for t in remarks(told, judge(told)))
+
+
 def test_few_measurements_are_said_to_be_too_few():
     few = [measurement(0, 20e-9), measurement(1, 20e-9, "crashed")]
     assert remarks(few, judge(few)) == [

@@ -1,0 +1,54 @@
+"""The parts of the benchmarks, and how they share the machine."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from typing import NamedTuple
+
+from benchmarks.row import Row
+
+# The long ones first: the processors are then busy to the end.
+RESULTS = (
+    *("other_plants", "identification", "disturbed", "honesty", "selfcal", "budget"),
+    *("spectra", "correction", "free_path"),
+)
+TIMES = ("speed", "form", "real_data", "offline", "live", "devices", "twin", "campaign", "viewer")
+PARTS = (*RESULTS, *TIMES)
+
+
+class Measured(NamedTuple):
+    """The rows of a part, and the seconds that it took: of the clock, of the processor."""
+
+    part: str
+    rows: list[Row]
+    wall: float
+    processor: float
+
+
+def _processor_time() -> float:
+    """Seconds that this process and those it waited for have taken."""
+    took = os.times()
+    return took.user + took.system + took.children_user + took.children_system
+
+
+def measure(part: str, full: bool) -> Measured:
+    """All rows of one part."""
+    begin, used = time.monotonic(), _processor_time()
+    rows = list(importlib.import_module(f"benchmarks.{part}").rows(full))
+    return Measured(part, rows, time.monotonic() - begin, _processor_time() - used)
+
+
+def measured(parts: list[str], full: bool) -> Iterator[Measured]:
+    """Every part, as it gets done."""
+    together = [part for part in RESULTS if part in parts]
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(measure, part, full) for part in together]):
+            yield done.result()
+    for part in TIMES:
+        if part in parts:
+            yield measure(part, full)
