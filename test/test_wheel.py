@@ -1,5 +1,6 @@
 """The wheel: ``pip install`` gives the offline commands where there is no ROS."""
 
+import ast
 import importlib.metadata
 import json
 import re
@@ -134,6 +135,22 @@ def test_no_required_package_is_under_the_gpl(package):
     assert not re.search(r"(?<!L)GPL|(?<!Lesser )General Public", told)
     listed = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
     assert f"| {package} |" in listed
+
+
+def test_the_licence_of_each_optional_package_is_named():
+    (extras,) = [
+        ast.literal_eval(keyword.value)
+        for node in ast.walk(ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == "extras_require"
+    ]
+    listed = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+    named = {
+        re.split(r"[\[<>=;]", one)[0] for name in extras.keys() - {"test"} for one in extras[name]
+    }
+    assert {"h5py", "websockets"} <= named
+    assert not {name for name in named if not re.search(rf"\b{name}\b \(", listed, re.IGNORECASE)}
 
 
 def test_workflows_and_citation_are_whole():
