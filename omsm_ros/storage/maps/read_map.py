@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from omsm_ros.storage.maps.x3p_file import read_x3p
 
 _HEAD_BYTES = 4096
 _BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V")
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _GRID_SAG_SUFFIXES = (".dat", ".grd")
 _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
@@ -48,6 +50,8 @@ def _head(path: Path) -> bytes:
             f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
             "'omsm form' its --calibration, too; one of ROS 1 needs 'omsm import' first"
         )
+    if head.startswith(_UTF_16):
+        raise FileError(f"map {str(path)!r} is text in UTF-16; save it as UTF-8")
     return head
 
 

@@ -116,6 +116,14 @@ def test_a_grid_sag_with_a_mark_of_the_encoding_is_one(tmp_path):
     assert len(read_points(path)) == 25
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_text_in_utf_16_is_told(tmp_path, encoding):
+    path = tmp_path / "map.dat"
+    path.write_bytes("\ufeff0 0 5\n1 0 6\n".encode(encoding))
+    with pytest.raises(FileError, match=r"map.dat' is text in UTF-16; save it as UTF-8"):
+        read_points(path)
+
+
 def test_a_height_that_is_missing_is_counted(tmp_path):
     points = read_points(_text(tmp_path, "x_m y_m z_m\n0 0 1\n1 0 nan\n0 1 NaN\n1 1 2\n"))
     assert (len(points), points.missing) == (2, 2)
