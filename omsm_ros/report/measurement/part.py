@@ -126,9 +126,8 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
         spread = settled(form, name)
         rows.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
-    for name, why in held.items():
-        spread = part(form, "pose", name, "uncertainty")
-        rows.append((f"not {name}", f"held: {why}", _size(spread, _POSE_UNITS[name])))
+    # Each says in words how well the points determine it.
+    rows += [(f"not {name}", f"held: {why}", NOTHING) for name, why in held.items()]
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
     rows += [
         (f"not {name}", f"{why}{dragged(form, name)}", NOTHING) for name, why in refused.items()
