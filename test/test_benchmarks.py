@@ -1,13 +1,17 @@
 """The yardsticks themselves: a bound that is one, and shares that count what they say."""
 
+import ast
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.against_truth import band_held, coverage
 from benchmarks.cramer_rao import response_bounds
+from benchmarks.parts import PARTS
+from benchmarks.parts import __file__ as parts_file
 from benchmarks.row import at_least, at_most, between, shown
 from omsm_ros.core.dynamics.calibration import REJECTED
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
@@ -111,3 +115,11 @@ def test_a_band_too_narrow_fails_however_many_runs_are_rejected(true_calibration
     assert rows["band held where accepted, it"]["value"] == 0.0
     assert rows["band held where accepted, it"]["holds"] is False
     assert rows["band held where rejected, it"]["runs"] == 6
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_every_part_has_rows(part):
+    """Not imported here: some parts need the peers that `make bench` installs."""
+    tree = ast.parse(Path(parts_file).with_name(f"{part}.py").read_text(encoding="utf-8"))
+    (rows,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "rows"]
+    assert [argument.arg for argument in rows.args.args] == ["full"]
