@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.verification.trend import FEWEST, Trend, outliers, trend
 from omsm_ros.readable import NOTHING, count, days, moment_of, percent, quantity
 from omsm_ros.report.common import style
@@ -17,6 +17,9 @@ from omsm_ros.report.common.tables import part
 from omsm_ros.report.common.template import fill, picture
 from omsm_ros.report.common.verdict import verdict_on_measurement
 from omsm_ros.units import DAY_S, NANOMETRE_M, NANOSECONDS_PER_S
+
+# What three digits do not show is no finding, however regular it is.
+_ALIKE = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +105,22 @@ def judge(measurements: Sequence[Measurement]) -> list[Judged]:
         values = np.array([_value(m, series) for m in measurements])
         if np.any(np.isfinite(values)):
             drift = trend(times, values) if series.judged else None
-            found.append(Judged(series, values, outliers(values) & series.judged, drift))
+            outlying = outliers(values) & _differs(values, np.nanmedian(values)) & series.judged
+            found.append(Judged(series, values, outlying, _seen(drift, times, values)))
     return found
+
+
+def _differs(values: FloatArray, usual: float) -> BoolArray:
+    """Return where values (n,) read otherwise than the usual one, at three digits."""
+    return np.asarray(np.abs(values - usual) > _ALIKE * abs(usual))
+
+
+def _seen(slope: Trend | None, over: FloatArray, values: FloatArray) -> Trend | None:
+    """Return a trend whose change over all measurements could be read, None for any other."""
+    if slope is None:
+        return None
+    change = slope.slope * np.ptp(over[np.isfinite(over)])
+    return slope if abs(change) > _ALIKE * abs(np.nanmedian(values)) else None
 
 
 def remarks(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> list[str]:
@@ -134,7 +151,7 @@ def _with_temperature(judged: Sequence[Judged]) -> list[str]:
     for one in judged:
         if not warm or one.series is TEMPERATURE or not one.series.judged:
             continue
-        slope = trend(warm[0], one.values)
+        slope = _seen(trend(warm[0], one.values), warm[0], one.values)
         if slope is not None and slope.significant:
             low, high = (quantity(s, one.series.unit) for s in (slope.low, slope.high))
             found.append(

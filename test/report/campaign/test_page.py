@@ -50,6 +50,14 @@ def test_what_goes_with_the_temperature_is_told_with_its_size():
     assert not any("Age" in t for t in remarks(told, judge(told)))
 
 
+def test_what_three_digits_do_not_show_is_no_finding():
+    random = np.random.default_rng(3)
+    alike = 20e-9 * (1 + 1e-5 * np.arange(14) + 1e-6 * random.normal(size=14))
+    alike[5] *= 1.001
+    told = [measurement(i, value) for i, value in enumerate(alike)]
+    assert remarks(told, judge(told)) == []
+
+
 def test_few_measurements_are_said_to_be_too_few():
     few = [measurement(0, 20e-9), measurement(1, 20e-9, "crashed")]
     assert remarks(few, judge(few)) == [
