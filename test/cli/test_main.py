@@ -265,7 +265,8 @@ def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_p
             bag.write_axes(axes)
             shaken = distance.distance + (wobble[at] if moving else 0.0)
             bag.write_distance(dataclasses.replace(distance, distance=shaken))
-    status, text, err = run(capsys, "identify", path, "--out", good, "--order", 2, "--json")
+    short = ("--order", 2, "--duration", 6)
+    status, text, err = run(capsys, "identify", path, "--out", good, *short, "--json")
     facts = json.loads(text)
     assert (status, facts["verdict"]) == (2, "rejected")
     assert err.count("\n") == 1
