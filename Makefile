@@ -13,6 +13,8 @@ RUN := . ./env.sh &&
 
 # The matrices here are small: threads of BLAS would only get into each other's way.
 export OMP_NUM_THREADS ?= 1
+# Each node and each command is a process: without bytecode every one would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 # The last numpy for Python 3.10 has older types, which disagree with today's in details.
 NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
