@@ -22,13 +22,22 @@ from omsm_ros.storage.table_file import rows_in
 
 _UNITS_M = (1e-3, 1e-2, 0.0254, 1.0)
 _METRES = 3
+# Height alone, with its derivatives, and with the flag.
+_NUMBERS_OF_A_POINT = (1, 4, 5)
 _COMMENT = "!"
 _LONGEST_LINE = 10_000
 
 
-def is_grid_sag(first: str) -> bool:
-    """Tell whether a text's first line without a comment is that of a grid sag file."""
-    return _first_line(first) is not None
+def is_grid_sag(first: str, second: str) -> bool:
+    """Tell whether the first two lines of a text, comments left out, are those of a grid sag file.
+
+    One of an unknown unit is one, too, where its second line shows that it is no table.
+    """
+    numbers = _first_line(first)
+    if numbers is None:
+        return False
+    lengths = len(second.split()), len(first.split())
+    return _has_unit(numbers) or lengths[1] != lengths[0] in _NUMBERS_OF_A_POINT
 
 
 def _first_line(text: str) -> tuple[float, ...] | None:
@@ -36,9 +45,14 @@ def _first_line(text: str) -> tuple[float, ...] | None:
         numbers = tuple(float(part) for part in text.split())
     except ValueError:
         return None
-    whole = len(numbers) in (5, 7) and all(n == int(n) >= 5 for n in numbers[:2])
-    fits = whole and min(abs(numbers[2]), abs(numbers[3])) > 0 and numbers[4] in range(4)
-    return numbers if fits and np.all(np.isfinite(numbers)) else None
+    if len(numbers) not in (5, 7) or not np.all(np.isfinite(numbers)):
+        return None
+    whole = all(n == int(n) >= 5 for n in numbers[:2]) and numbers[4] == int(numbers[4])
+    return numbers if whole and min(abs(numbers[2]), abs(numbers[3])) > 0 else None
+
+
+def _has_unit(first: tuple[float, ...]) -> bool:
+    return first[4] in range(len(_UNITS_M))
 
 
 def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
@@ -60,6 +74,11 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
             raise FileError(
                 f"{what} does not begin with columns, rows (5 or more), two spacings, unit and "
                 "decentres"
+            )
+        if not _has_unit(first):
+            raise FileError(
+                f"{what} has unit {int(first[4])}, the fifth number of its first line, expected "
+                "0 (mm), 1 (cm), 2 (inch) or 3 (m); correct it"
             )
         scale = _UNITS_M[int(first[4])]
         refuse_other(units, LengthUnits(scale, scale), what)

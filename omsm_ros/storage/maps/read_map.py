@@ -67,7 +67,7 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         return replace(found, notes=(*found.notes, *unasked))
     if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
         return read_foreign(path, units)
-    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(_first_data_line(head)):
+    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
         return read_grid_sag(path, units).points()
     return read_columns(path, units)
 
@@ -83,6 +83,9 @@ def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
     return read_dabam(path) if has_dabam_header(path) else None
 
 
-def _first_data_line(head: bytes) -> str:
+def _first_lines(head: bytes) -> tuple[str, str]:
+    """Return the first two lines that are neither empty nor comments, empty where there is none."""
     lines = head.decode("utf-8-sig", "replace").splitlines()
-    return next((line for line in lines if line.strip() and not line.startswith("!")), "")
+    data = [line for line in lines if line.strip() and not line.startswith("!")]
+    first, second = (*data[:2], "", "")[:2]
+    return first, second

@@ -217,6 +217,8 @@ def test_the_slopes_of_a_grid_sag_are_those_of_the_surface(tmp_path):
         ("6 5 0.5 0.25 0 0 0\n1 0 0 0\n", r"says 6 × 5 points and has 1"),
         ("6 5 0.5 0.25 0 0 0\nz\n", "is no table"),
         ("90000 90000 0.5 0.25 0 0 0\n1\n", "number of points is 8100000000"),
+        ("6 5 0.5 0.25 9 0 0\n1 0 0 0 0\n", r"unit 9, the fifth .* 0 \(mm\), .* 3 \(m\)"),
+        ("! by hand\n6 5 0.5 0.25 -1\n1\n", "has unit -1"),
     ],
 )
 def test_a_grid_sag_that_lies_is_refused(tmp_path, text, told):
@@ -230,9 +232,16 @@ def test_a_map_that_readers_would_refuse_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_seven_columns_are_no_grid_sag(tmp_path):
-    text = "x_m y_m z_m a b c d\n" + "6 5 0.5 0.25 0 0 0\n" * 3
+@pytest.mark.parametrize("unit", [0, 9])
+def test_seven_columns_are_no_grid_sag(tmp_path, unit):
+    text = "x_m y_m z_m a b c d\n" + f"6 5 0.5 0.25 {unit} 0 0\n" * 3
     assert read_points(_text(tmp_path, text, "map.dat")).height.tolist() == [0.5] * 3
+
+
+def test_seven_columns_without_a_header_are_no_grid_sag_of_an_unknown_unit(tmp_path):
+    path = _text(tmp_path, "6 5 0.5 0.25 9 0 0\n" * 3, "map.dat")
+    with pytest.raises(FileError, match="--unit"):
+        read_points(path)
 
 
 def test_by_place_sees_a_transposed_map():
