@@ -163,20 +163,27 @@ def _scores(
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
         residual = deviation[chunk] - coefficients @ columns
         weighted = columns if weights is None else columns * weights[chunk]
-        edges = np.arange(0, columns.shape[1], size)
-        lengths = np.diff(edges, append=columns.shape[1])
         products = weighted * residual
         single += products @ products.T
-        sums = np.add.reduceat(products, edges, axis=1)
-        followed = sums
+        # A matrix (k, points) a group: its products stay in the cache that the columns are in.
+        blocks, weighted_blocks = _by_groups(columns, size), _by_groups(weighted, size)
+        followed = _by_groups(products, size).sum(axis=2, keepdims=True)
+        sums = followed
         for _ in range(_FOLLOWED):
-            back = np.repeat(inverse @ followed, lengths, axis=1)
-            followed = np.add.reduceat(weighted * np.sum(columns * back, axis=0), edges, axis=1)
+            along = (inverse @ followed).transpose(0, 2, 1) @ blocks
+            followed = weighted_blocks @ along.transpose(0, 2, 1)
             sums = sums + followed
-        together += sums @ sums.T
+        together += sums[..., 0].T @ sums[..., 0]
     groups = max(-(-len(x) // size), 2)
     freedom = max(1 - len(terms) / len(x), 1e-3)
     return together * groups / (groups - 1) / freedom, single / freedom
+
+
+def _by_groups(columns: FloatArray, size: int) -> FloatArray:
+    """Return ``columns`` (k, n) as groups (g, k, size) of successive points, the last with zeros."""
+    short = -columns.shape[1] % size
+    whole = np.pad(columns, ((0, 0), (0, short))) if short else columns
+    return whole.reshape(len(columns), -1, size).transpose(1, 0, 2)
 
 
 def _no_less(covariance: FloatArray, floor: FloatArray) -> FloatArray:
