@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
 from omsm_ros.storage import strict_json
+from omsm_ros.storage.maps.length_units import LengthUnits, units_of
 from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
 
@@ -128,3 +129,18 @@ def add_by_stamps(sub: argparse.ArgumentParser) -> None:
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     """Return what is stated of the counters."""
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)
+
+
+def _unit(text: str) -> LengthUnits:
+    """Return the argument type: the unit of a file that does not carry it."""
+    try:
+        return units_of(text)
+    except FileError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+UNIT: dict[str, Any] = {
+    "type": _unit,
+    "metavar": "UNIT[,HEIGHT_UNIT]",
+    "help": "of files that do not carry it, as mm, or mm,nm",
+}

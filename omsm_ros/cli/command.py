@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from omsm_ros.core.dynamics.calibration import REJECTED
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 
 Facts: TypeAlias = "dict[str, Any]"
 

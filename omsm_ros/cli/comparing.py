@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import UNIT, number
 from omsm_ros.cli.command import Command, Facts, table
-from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import freedoms
 from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
 from omsm_ros.errors import ConfigurationError

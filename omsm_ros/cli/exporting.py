@@ -4,30 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import UNIT, number
 from omsm_ros.cli.command import Command, Facts, table
-from omsm_ros.errors import FileError
 from omsm_ros.jobs.export_points import export
 from omsm_ros.readable import count, quantity
-from omsm_ros.storage.maps.length_units import LengthUnits, units_of
-
-
-def unit(text: str) -> LengthUnits:
-    """Return the argument type: the unit of a file that does not carry it."""
-    try:
-        return units_of(text)
-    except FileError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
-
-
-UNIT: dict[str, Any] = {
-    "type": unit,
-    "metavar": "UNIT[,HEIGHT_UNIT]",
-    "help": "of files that do not carry it, as mm, or mm,nm",
-}
 
 
 def _declare_export(sub: argparse.ArgumentParser) -> None:

@@ -6,15 +6,13 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, cell_of, number, refuse_cell
+from omsm_ros.cli.arguments import UNIT, add_bags, cell_of, number, refuse_cell
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
-from omsm_ros.cli.exporting import UNIT
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.registration.freedoms import AUTO
 from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
 from omsm_ros.jobs.judge_form import draw_form, judge_form
-from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.measured_portions import open_measurement
 from omsm_ros.jobs.show_surface import Scan, show_surface
 from omsm_ros.readable import plain, quantity
@@ -51,6 +49,9 @@ def _form(args: argparse.Namespace) -> Facts:
     with result_folder(args.out, _WRITTEN) as out:
         source = args.measured
         if args.calibration:
+            # Here, because what corrects takes longer to load than many a form to judge.
+            from omsm_ros.jobs.measure import measure
+
             calibration = load_calibration(args.calibration)
             with progress_bar("correcting", args.json) as progress:
                 bag = cell_of(source, args)

@@ -25,7 +25,8 @@ from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.lateral_errors import LateralErrors, add_lateral_errors
-from omsm_ros.jobs.read_bag import MOST_JUDGED, Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.jobs.read_bag import MOST_JUDGED
 from omsm_ros.storage.cloud_file import PlyWriter
 from omsm_ros.storage.recording.topics import AnyBag
 

@@ -19,7 +19,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.slips import CommonTrigger, Slip
 from omsm_ros.errors import BagError
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 

@@ -10,7 +10,8 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.verification.counter_offset import CounterOffset, counter_offset
 from omsm_ros.errors import DataError
-from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
+from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.jobs.read_bag import read_blocks
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 from omsm_ros.units import NANOSECONDS_PER_S

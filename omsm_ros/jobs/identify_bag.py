@@ -10,7 +10,8 @@ from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import BagError, ConfigurationError
-from omsm_ros.jobs.read_bag import Progress, no_progress, read_blocks
+from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.jobs.read_bag import read_blocks
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag

@@ -25,7 +25,7 @@ from omsm_ros.core.samples.foreign_columns import (
 )
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.jobs.foreign_rows import Origin, RowCounter
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.foreign.open_tables import open_tables
 from omsm_ros.storage.foreign.table import ForeignTable, TableForm, stated_unit

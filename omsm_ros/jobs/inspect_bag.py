@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from omsm_ros.core.samples.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import relative
 

@@ -27,7 +27,7 @@ from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
 from omsm_ros.jobs.judge_scan import Judgement, with_sources
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, save_json
 from omsm_ros.storage.recording.topics import AnyBag

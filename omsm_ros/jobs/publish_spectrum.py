@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.jobs.spectrum import (
     SpectrumOfScan,
     SpectrumOptions,

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from omsm_ros.core.machine.scan_path import PathStart, ScanPath
 from omsm_ros.core.samples.blocks import Block
 from omsm_ros.errors import BagError
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 
 MOST_JUDGED = 2**20
 """Samples of a path that are judged: a quarter of an hour at 1 kHz, of a spiral the fastest."""
-
-Progress = Callable[[int, int], None]
-"""Called with what is done and what there is in all: messages, lines or bags."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Report to nobody."""
 
 
 def read_blocks(

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from omsm_ros import __version__
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import SUMMARY, read_text, said, save_json

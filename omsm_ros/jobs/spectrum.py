@@ -32,7 +32,8 @@ from omsm_ros.core.spectra.scan_signal import (
 from omsm_ros.core.verification.resolved_calibration import unit_calibration
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.corrected_scan import Admission, CorrectedScan
-from omsm_ros.jobs.read_bag import Progress, no_progress, sample_period_in
+from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.jobs.read_bag import sample_period_in
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 

@@ -29,7 +29,8 @@ from omsm_ros.core.verification.self_calibration import (
 )
 from omsm_ros.errors import BagError
 from omsm_ros.jobs.corrected_scan import CorrectedScan
-from omsm_ros.jobs.read_bag import Progress, no_progress, sample_period_in
+from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.jobs.read_bag import sample_period_in
 from omsm_ros.storage.recording.topics import AnyBag
 
 # What is to be found must not be in the points already.

@@ -12,7 +12,7 @@ from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.core.verification.free_path import PathCheck, check_path
 from omsm_ros.jobs.identify_bag import motion_of_bag
-from omsm_ros.jobs.read_bag import Progress, no_progress
+from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.storage.recording.topics import AnyBag
 
 

@@ -165,22 +165,36 @@ def _scores(
         weighted = columns if weights is None else columns * weights[chunk]
         products = weighted * residual
         single += products @ products.T
-        # A matrix (k, points) a group: its products stay in the cache that the columns are in.
-        blocks, weighted_blocks = _by_groups(columns, size), _by_groups(weighted, size)
-        followed = _by_groups(products, size).sum(axis=2, keepdims=True)
-        sums = followed
-        for _ in range(_FOLLOWED):
-            along = (inverse @ followed).transpose(0, 2, 1) @ blocks
-            followed = weighted_blocks @ along.transpose(0, 2, 1)
-            sums = sums + followed
-        together += sums[..., 0].T @ sums[..., 0]
+        sums = _sums(products, columns, weighted, inverse, size)
+        together += sums @ sums.T
     groups = max(-(-len(x) // size), 2)
     freedom = max(1 - len(terms) / len(x), 1e-3)
     return together * groups / (groups - 1) / freedom, single / freedom
 
 
+def _sums(
+    products: FloatArray, columns: FloatArray, weighted: FloatArray, inverse: FloatArray, size: int
+) -> FloatArray:
+    """Return sums of ``products`` (k, n) over groups (k, g), as the fit to all others leaves them.
+
+    size: points of a group
+    """
+    if size == 1:
+        share = np.sum(weighted * (inverse @ columns), axis=0)
+        return np.asarray(products * sum(share**n for n in range(_FOLLOWED + 1)))
+    # A matrix (k, size) a group: its products stay in the cache that the columns are in.
+    blocks, weighted_blocks = _by_groups(columns, size), _by_groups(weighted, size)
+    followed = _by_groups(products, size).sum(axis=2, keepdims=True)
+    sums = followed
+    for _ in range(_FOLLOWED):
+        along = (inverse @ followed).transpose(0, 2, 1) @ blocks
+        followed = weighted_blocks @ along.transpose(0, 2, 1)
+        sums = sums + followed
+    return np.asarray(sums[..., 0].T)
+
+
 def _by_groups(columns: FloatArray, size: int) -> FloatArray:
-    """Return ``columns`` (k, n) as groups (g, k, size) of successive points, the last with zeros."""
+    """Return ``columns`` (k, n) as groups (g, k, size) of points in turn, the last with zeros."""
     short = -columns.shape[1] % size
     whole = np.pad(columns, ((0, 0), (0, short))) if short else columns
     return whole.reshape(len(columns), -1, size).transpose(1, 0, 2)

@@ -295,6 +295,8 @@ def most_like(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, f
         fitted = np.asarray(solve @ (near @ deviation[chosen]), np.float64)
         residual = deviation - fitted @ columns
         limit = limit_of(residual)
+        if np.array_equal(np.abs(residual) <= limit, chosen):
+            break
     return fitted / scale, limit
 
 

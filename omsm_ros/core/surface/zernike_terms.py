@@ -88,9 +88,9 @@ def rms_of(term: Term) -> float:
 def _jacobi(
     t: FloatArray, m: int, highest: int, slopes: bool
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield P_k^(0,m)(t) and its derivative, zero unless asked for, for k = 0 to ``highest``."""
+    """Yield P_k^(0,m)(t) and its derivative, 0 if not asked for, for k = 0 to ``highest``."""
     before, value = np.zeros_like(t), np.ones_like(t)
-    before_slope, slope = np.zeros_like(t), np.zeros_like(t)
+    before_slope, slope = (np.zeros_like(t) if slopes else np.zeros(()) for _ in range(2))
     yield value, slope
     for k in range(highest):
         if k == 0:
@@ -119,15 +119,16 @@ def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[Term]) -> Float
     """Return the terms (k, n), one at the rim, at x, y (n,) of the unit disc."""
     made = np.empty((len(terms), *np.shape(x)))
     t = 2 * (x**2 + y**2) - 1
-    base, power = x + 1j * y, np.ones_like(x, np.complex128)
+    # (x + iy)^m, each part by itself: numbers of one part lie side by side.
+    real, imaginary = np.ones_like(t), np.zeros_like(t)
     groups = _by_angle(terms)
     for m in range(max(groups, default=0) + 1):
         wanted = groups.get(m, ())
         radial = [value for value, _ in _jacobi(t, m, max((k for _, k, _ in wanted), default=0),
                                                 False)] if wanted else []  # fmt: skip
         for place, k, sine in wanted:
-            np.multiply(radial[k], power.imag if sine else power.real, out=made[place])
-        power = power * base
+            np.multiply(radial[k], imaginary if sine else real, out=made[place])
+        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
     return made
 
 
