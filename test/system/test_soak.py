@@ -16,6 +16,8 @@ from system.broken_wire import BrokenWire
 
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.twin.cell import blocks_of
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(0)]
 
@@ -30,23 +32,34 @@ MOST_GROWTH = 0.01
 LONGEST_FAULT_S = 3.0
 
 
-def resident_bytes(pid):
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
+def held_bytes(pid):
+    """Memory that a process holds: its own, and that of the middleware's segments.
+
+    Pages of libraries are the system's, which fetches and drops them as it likes.
+    """
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    sizes = dict(line.split(":", 1) for line in lines)
+    return 1024 * sum(int(sizes[name].split()[0]) for name in ("RssAnon", "RssShmem"))
 
 
 class Hour:
     """A cell behind a wire that breaks, and what is done to it."""
 
-    def __init__(self, cell, wire, calibration):
+    def __init__(self, cell, wire, calibration, step_test):
         self.cell, self.wire = cell, wire
+        self.steps = cell.folder / "steps.mcap"
+        with BagWriter(self.steps, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+            for axes, distance in blocks_of(step_test):
+                bag.write_axes(axes)
+                bag.write_distance(distance)
         self.calibration_file = cell.folder / "cal.json"
         save_calibration(self.calibration_file, calibration)
         self.bags = []
         self.restart = {
             "confocal_driver": lambda: cell.start_driver(port=f"tcp://127.0.0.1:{wire.port}"),
+            # Another calibration would begin another account.
             "corrector": lambda: cell.processes.start(
-                "corrector", calibration=str(self.calibration_file)
+                "corrector", calibration=str(self.calibration_file), follow_calibrator=False
             ),
             # Less than it has room for would be memory that grows as it should.
             "calibrator": lambda: cell.processes.start(
@@ -126,6 +139,10 @@ class Hour:
         ):
             assert self.cell.call(kind, name, **fields).message
 
+    def identified(self):
+        """What is no fault, but the largest piece of work that a node is asked for."""
+        assert self.cell.call(Identify, "calibrator/identify", bag=str(self.steps)).success
+
     def killed(self, node):
         self.cell.processes.end(node, how=signal.SIGKILL)
         self.cell.operator._status.pop(node, None)
@@ -139,13 +156,14 @@ class Hour:
         lasting = [self.network_gone, self.connection_cut, self.noise_on_the_wire]
         lasting += [lambda n=node: self.stopped(n) for node in NODES]
         lasting += [lambda: self.deactivated("confocal_driver"), self.foolish_requests]
+        lasting.append(self.identified)
         killed = [lambda n=node: self.killed(n) for node in NODES if node != "corrector"]
         return lasting, killed
 
 
-def test_an_hour_with_a_fault_every_minute(cell, true_calibration):
+def test_an_hour_with_a_fault_every_minute(cell, true_calibration, step_test):
     with BrokenWire(DEVICE_PORT) as wire:
-        hour = Hour(cell, wire, true_calibration)
+        hour = Hour(cell, wire, true_calibration, step_test)
         hour.start()
         lasting, killed = hour.faults()
         both = itertools.chain.from_iterable(zip(itertools.cycle(killed), itertools.cycle(lasting)))
@@ -165,7 +183,7 @@ def test_an_hour_with_a_fault_every_minute(cell, true_calibration):
 
 
 def strike(hour, faults, until):
-    """Let faults come until so many samples are played, or all came; resident memory then."""
+    """Let faults come until so many samples are played, or all came; the memory held then."""
     for fault in faults:
         if hour.played >= until:
             break
@@ -177,7 +195,7 @@ def strike(hour, faults, until):
 
 
 def memory(hour):
-    return {node: resident_bytes(hour.cell.processes.pid(node)) for node in NODES}
+    return {node: held_bytes(hour.cell.processes.pid(node)) for node in NODES}
 
 
 def the_account_is_closed(cell):

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 class EvenSelection:
     """Keeps every k-th row, k the least power of two with which no more than ``most`` are kept.
 
-    What is kept does not depend on how the stream was cut.
+    What is kept does not depend on how the stream was cut. It lies in one piece: of small parts
+    each would cost more than its rows, for as long as the stream lasts.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._every = 1
         self._seen = 0
-        self._parts: list[NDArray[Any]] = []
+        self._room: NDArray[Any] = np.empty(0)
 
     def __len__(self) -> int:
         """Rows kept."""
@@ -31,7 +32,7 @@ class EvenSelection:
 
     def add(self, rows: NDArray[Any]) -> None:
         """Take in the next ``rows`` (n, …)."""
-        self.add_chosen(rows[self.chosen(len(rows))].copy(), len(rows))
+        self.add_chosen(rows[self.chosen(len(rows))], len(rows))
 
     def chosen(self, rows: int) -> slice:
         """Return which of the next ``rows`` are wanted, for whoever makes only those."""
@@ -41,20 +42,26 @@ class EvenSelection:
 
     def add_chosen(self, part: NDArray[Any], rows: int) -> None:
         """Take in what :meth:`chosen` asked for, (k, …), of the next ``rows``."""
+        held = len(self)
         self._seen += rows
         if len(part):
-            self._parts.append(part)
+            self._make_room(held, part)
+            self._room[held : held + len(part)] = part
+
+    def _make_room(self, held: int, part: NDArray[Any]) -> None:
+        needed = held + len(part)
+        if needed > len(self._room):
+            room = np.empty((min(max(2 * held, needed), self._most), *part.shape[1:]), part.dtype)
+            if held:
+                room[:held] = self._room[:held]
+            self._room = room
 
     def _halve(self) -> None:
-        """Leave out every other row, part by part, for all at once would need them twice."""
-        before = 0
-        for place, part in enumerate(self._parts):
-            self._parts[place] = part[before % 2 :: 2].copy()
-            before += len(part)
+        """Leave out every other row."""
+        held = len(self)
+        self._room[: -(-held // 2)] = self._room[:held:2].copy()
         self._every *= 2
 
     def rows(self) -> NDArray[Any]:
-        """Return all rows kept so far, in order; empty before the first."""
-        if len(self._parts) != 1:
-            self._parts = [np.concatenate(self._parts)] if self._parts else [np.empty(0)]
-        return self._parts[0]
+        """Return all rows kept so far, in order, until the next are added; empty before any."""
+        return self._room[: len(self)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from omsm_ros.units import MILLISECOND_S, NANOSECOND_S
@@ -16,13 +14,15 @@ class LoadMeter:
     """
 
     def __init__(self, window: int = 10_000) -> None:
-        self._latencies: deque[int] = deque(maxlen=window)
+        self._latencies = np.zeros(window, np.int64)  # of the newest, in a ring [ns]
+        self._blocks = 0
         self._cpu = self._wall = 0.0
         self._worst_ns = 0
 
     def block(self, arrived_ns: int, done_ns: int) -> None:
         """Note the block that arrived at ``arrived_ns`` and was done at ``done_ns`` [ns]."""
-        self._latencies.append(done_ns - arrived_ns)
+        self._latencies[self._blocks % len(self._latencies)] = done_ns - arrived_ns
+        self._blocks += 1
         self._worst_ns = max(self._worst_ns, done_ns - arrived_ns)
 
     def worst_ms(self) -> float:
@@ -38,8 +38,8 @@ class LoadMeter:
         share = (cpu - self._cpu) / (wall - self._wall) if wall > self._wall else 0.0
         self._cpu, self._wall = cpu, wall
         found = {"cpu_share": round(share, 4)}
-        if self._latencies:
-            points = np.percentile(np.fromiter(self._latencies, np.float64), (50, 99, 100))
+        if self._blocks:
+            points = np.percentile(self._latencies[: self._blocks], (50, 99, 100))
             scaled = points * NANOSECOND_S / MILLISECOND_S
             names = ("latency_median_ms", "latency_p99_ms", "latency_max_ms")
             found |= {

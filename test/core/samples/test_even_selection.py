@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -38,3 +40,14 @@ def test_rows_may_have_any_shape_and_are_copies(shape: tuple[int, ...]) -> None:
     before = rows.copy()
     rows[:] = 0.0
     assert np.array_equal(kept.rows(), before)
+
+
+def test_memory_is_that_of_the_rows_however_small_the_parts() -> None:
+    """A live scan brings parts of a row or two, without end."""
+    kept, part = EvenSelection(1000), np.ones((7, 10))
+    tracemalloc.start()
+    for _ in range(30_000):
+        kept.add(part)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 1.1 * 1000 * part[0].nbytes + 2000
