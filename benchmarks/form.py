@@ -312,7 +312,7 @@ def _process(folder: Path, points: int) -> tuple[float, float]:
     words = ["form", str(cloud), "--nominal", str(folder / "mirror.yaml"), "--json"]
     words += ["--out", str(folder / "out")]
     script = (
-        "import json, resource, sys; from omsm_ros.cli.main import main; "
+        "import json, resource, sys; from omsm_ros.cli import main; "
         "status = main(sys.argv[1:]); used = resource.getrusage(resource.RUSAGE_SELF); "
         "print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20]), "
         "file=sys.stderr); sys.exit(status)"

@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from omsm_ros import quantities
-from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.command_line import parser_of
 from omsm_ros.cli.words import WORDS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -21,7 +21,7 @@ LAYERS = [
     {"core"},
     {"parameters"},
     {"quantities"},
-    {"errors", "units", "readable", "least_squares", "scipy_parts"},
+    {"errors", "units", "readable", "least_squares", "scipy_parts", "loading", "seconds"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 
@@ -267,7 +267,7 @@ def test_a_test_is_read_in_one_sitting(path):
 
 BROKEN = [
     (one_way, "core.dynamics.new", "from omsm_ros.storage.bags import BagReader", "looks up at"),
-    (one_way, "jobs.new", "import omsm_ros.cli.main", "looks up at"),
+    (one_way, "jobs.new", "import omsm_ros.cli.command_line", "looks up at"),
     (one_way, "twin.new", "from omsm_ros import devices", "looks up at"),
     (one_way, "jobs.new", "from . import measure", "relative import"),
     (one_way, "attic.new", "", "belongs to no layer"),

@@ -210,6 +210,6 @@ def test_an_offline_command_is_added_in_cli(tmp_path):
         "COMMANDS = [Command('weigh', declare,\n"
         "    lambda args: {'kg': args.grams / 1000}, print)]\n"
     )
-    main = "from omsm_ros.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    main = "from omsm_ros.cli import main; sys.exit(main(sys.argv[1:]))"
     assert json.loads(run(main, "weigh", "--json", "250")) == {"kg": 0.25}
     assert "what it weighs" in run(main, "--help")

@@ -1,10 +1,29 @@
 """``omsm``: the offline commands.
 
 Exit status 0: done; 2: bad input, with one line on stderr that says what to do; 70: a defect
-of ours, with one line on stderr that says what to report. With ``--json`` standard output holds
-one JSON object and nothing else.
+of ours, with one line on stderr that says what to report; 130: interrupted. With ``--json``
+standard output holds one JSON object and nothing else.
 """
 
-from omsm_ros.cli.main import main
+from __future__ import annotations
 
-__all__ = ["main"]
+import signal
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+
+from omsm_ros.loading import nothing_to_undo
+
+INTERRUPTED = 130
+INTERRUPTION = "interrupted; no unfinished file was left"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    with interruptible():
+        from omsm_ros.cli import command_line
+    return command_line.main(arguments)
+
+
+def interruptible() -> AbstractContextManager[None]:
+    """Let Ctrl-C while something only loads end the command as it does later."""
+    return nothing_to_undo((signal.SIGINT,), INTERRUPTED, f"omsm: {INTERRUPTION}\n")

@@ -2,6 +2,6 @@
 
 import sys
 
-from omsm_ros.cli.main import main
+from omsm_ros.cli import main
 
 sys.exit(main())

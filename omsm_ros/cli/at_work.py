@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Event, Thread
+from functools import partial
+from threading import Event
+
+from omsm_ros.seconds import beside, tick
 
 # What is over before that needs no line.
 _PATIENCE_S = 1.0
-_TICK_S = 0.5
 
 
 @contextmanager
@@ -21,22 +23,15 @@ def at_work(title: str, quiet: bool) -> Iterator[None]:
     if quiet or not sys.stderr.isatty():
         yield
         return
-    done = Event()
-    ticking = Thread(target=_tick, args=(title, done), daemon=True)
-    ticking.start()
-    try:
+    with beside(partial(_show, title)):
         yield
-    finally:
-        done.set()
-        ticking.join()
 
 
-def _tick(title: str, done: Event) -> None:
+def _show(title: str, done: Event) -> None:
     if done.wait(_PATIENCE_S):
         return
     from tqdm import tqdm
 
     with tqdm(desc=title, bar_format="{desc}: {elapsed} so far", leave=False) as line:
         line.start_t -= _PATIENCE_S
-        while not done.wait(_TICK_S):
-            line.refresh()
+        tick(line, done)

@@ -19,7 +19,7 @@ def _completion(args: argparse.Namespace) -> Facts:
         import shtab
     except ImportError as err:
         raise ConfigurationError("completion needs shtab: pip install shtab") from err
-    from omsm_ros.cli.main import parser_of  # which knows of this module
+    from omsm_ros.cli.command_line import parser_of  # which knows of this module
     from omsm_ros.cli.words import WORDS
 
     parser = parser_of(WORDS)

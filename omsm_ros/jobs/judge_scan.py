@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -15,9 +15,11 @@ from omsm_ros.core.correction.scan_fields import resolves_turns, scan_fields
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.jobs.correct_bag import Correction
 from omsm_ros.storage.fields_file import save_fields
 from omsm_ros.storage.files import SYSTEMATIC
+
+if TYPE_CHECKING:  # it would load what reads bags, for a live scan
+    from omsm_ros.jobs.correct_bag import Correction
 
 # What a fit takes out of the deviations is no error of theirs any more; how well it does is in
 # the uncertainty of the form.

@@ -6,7 +6,7 @@ import time
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import Identify
@@ -19,13 +19,11 @@ from omsm_ros.core.dynamics.calibration import (
     settings_with,
     verdict_of,
 )
-from omsm_ros.core.identification.identify import Identification, identify
 from omsm_ros.core.samples.motion_buffer import BlockBuffer
 from omsm_ros.core.samples.motion_record import MotionRecord, assemble
 from omsm_ros.core.samples.recent import RecentIncrease
 from omsm_ros.core.samples.stamped_period import check_period
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
-from omsm_ros.jobs.identify_bag import motion_of_bag, recorded_ns_of_bag, settings_of_bag
 from omsm_ros.jobs.remember import remembered
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
@@ -38,6 +36,11 @@ from omsm_ros.parameters import Parameter
 from omsm_ros.storage import conversions
 from omsm_ros.storage.calibration_folder import CalibrationFolder
 from omsm_ros.storage.claim import claimed
+
+# What identifies takes seconds to load on a small computer, and samples are kept without it: each
+# piece of work loads its own, beside them.
+if TYPE_CHECKING:
+    from omsm_ros.core.identification.identify import Identification
 
 PARAMETERS = (
     Parameter("buffer_samples", 3_600_000, "samples kept per topic", quantities.BUFFER_SAMPLES),
@@ -211,16 +214,15 @@ class CalibratorNode(ManagedNode):
             )
         stated, source = self._settings, request.input or "encoder"
         if request.bag:
-            settings = partial(settings_of_bag, Path(request.bag), stated)
-            recorded = partial(recorded_ns_of_bag, Path(request.bag))
+            told = partial(_told_by_bag, Path(request.bag), stated)
         else:
-            settings = partial(settings_with, stated, [self._probe])
-            recorded = partial(int, self.get_clock().now().nanoseconds)
-        return lambda: identify(
-            motion(), order=order, input=source, settings=settings(), recorded_ns=recorded()
-        )
+            now_ns = int(self.get_clock().now().nanoseconds)
+            told = partial(_told_live, stated, self._probe, now_ns)
+        return lambda: _identified(motion(), order=order, input=source, **told())
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
+        from omsm_ros.jobs.identify_bag import motion_of_bag
+
         return motion_of_bag(
             bag, duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
         )
@@ -253,6 +255,22 @@ class CalibratorNode(ManagedNode):
         if self._trouble:
             report.add(WARN, self._trouble)
         return report
+
+
+def _identified(*motion: Any, **options: Any) -> Identification:
+    from omsm_ros.core.identification.identify import identify
+
+    return identify(*motion, **options)
+
+
+def _told_by_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
+    from omsm_ros.jobs.identify_bag import recorded_ns_of_bag, settings_of_bag
+
+    return {"settings": settings_of_bag(bag, stated), "recorded_ns": recorded_ns_of_bag(bag)}
+
+
+def _told_live(stated: dict[str, object], probe: dict[str, object], now_ns: int) -> dict[str, Any]:
+    return {"settings": settings_with(stated, [probe]), "recorded_ns": now_ns}
 
 
 def main() -> None:

@@ -14,8 +14,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 
 import rclpy
@@ -29,12 +29,12 @@ from omsm_ros.emulators.players import EMULATED
 from omsm_ros.errors import DeviceTimeoutError, OmsmError
 from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
+from omsm_ros.seconds import beside, tick
 
 _DISCOVERY_S = 0.3
 _SERVICE_TIMEOUT_S = 60.0
 _STALL_TIMEOUT_S = 60.0
 _PREFIX = "/omsm/"
-_TICK_S = 0.5
 
 
 class DemoNode(Node):
@@ -105,24 +105,6 @@ class DemoNode(Node):
         return answer
 
 
-@contextmanager
-def _ticking(bar: tqdm[Any]) -> Iterator[None]:
-    """Let the seconds of a bar go on while nothing is counted."""
-    done = Event()
-
-    def tick() -> None:
-        while not done.wait(_TICK_S):
-            bar.refresh()
-
-    ticking = Thread(target=tick, daemon=True)
-    ticking.start()
-    try:
-        yield
-    finally:
-        done.set()
-        ticking.join()
-
-
 class Stage:
     """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
 
@@ -142,7 +124,7 @@ class Stage:
         silent = self._quiet or plain
         with (
             tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
-            _ticking(bar),
+            beside(partial(tick, bar)),
         ):
             yield lambda done: bar.update(done - bar.n)
             bar.update((total or bar.n) - bar.n)

@@ -15,12 +15,12 @@ from std_msgs.msg import String
 
 from omsm_ros.core.correction.applicability import admit, objections
 from omsm_ros.core.correction.correct import Corrector
+from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.merging import consecutive
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs.judge_scan import live_light, with_sources
-from omsm_ros.jobs.predict_motion import predict_from
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
@@ -154,7 +154,7 @@ class CorrectorNode(ManagedNode):
     ) -> None:
         prediction = await self._aside.do(
             partial(
-                predict_from,
+                _prediction,
                 self._topic.calibration,
                 request.bag,
                 request.z,
@@ -235,6 +235,13 @@ class CorrectorNode(ManagedNode):
         if self._topic.refused:
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report
+
+
+def _prediction(*motion: Any) -> Prediction:
+    # What reads bags takes as long to load as all else; most correctors are never asked.
+    from omsm_ros.jobs.predict_motion import predict_from
+
+    return predict_from(*motion)
 
 
 def main() -> None:

@@ -21,9 +21,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
+from omsm_ros.loading import nothing_to_undo
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
-from omsm_ros.nodes.start import ENDING, nothing_to_undo
+from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
 from omsm_ros.storage import strict_json
 
@@ -42,7 +43,7 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
     """
     node = None
     try:
-        with nothing_to_undo():
+        with nothing_to_undo(ENDING):
             _init()
         ending = _Ending()  # after rclpy, which puts back the handlers of the system
         node = make_node()

@@ -13,9 +13,9 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+
+from omsm_ros.loading import nothing_to_undo
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a node to end."""
@@ -41,7 +41,7 @@ _NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
 def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
-    with nothing_to_undo():
+    with nothing_to_undo(ENDING):
         end_with_launch()
         share_one_pool()
         for package, remedy in _NEEDED.items():
@@ -75,18 +75,6 @@ def share_one_pool() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc has it
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
-
-
-@contextmanager
-def nothing_to_undo() -> Iterator[None]:
-    """Let a signal end the process at once and well, while it only loads."""
-    before = {number: signal.getsignal(number) for number in ENDING}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as SIGHUP is below nohup
-            signal.signal(number, lambda *_: os._exit(0))
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 if __name__ == "__main__":

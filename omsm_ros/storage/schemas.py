@@ -7,12 +7,13 @@ the one table.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-import jsonschema
+from typing import TYPE_CHECKING, Any
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.quantities import shown
+
+if TYPE_CHECKING:
+    import jsonschema
 
 NUMBER: Mapping[str, Any] = {"type": "number"}
 
@@ -31,6 +32,9 @@ def check_form(
     content: Mapping[str, Any], schema: Mapping[str, Any], error: type[OmsmError], what: str
 ) -> None:
     """Raise ``error``, which calls the content ``what``, unless it follows ``schema``."""
+    # A tenth of a second to load, which a node that reads no file has no use for.
+    import jsonschema
+
     found = next(jsonschema.Draft202012Validator(schema).iter_errors(content), None)
     if found is not None:
         raise error(f"{what}: {_said(found)}")

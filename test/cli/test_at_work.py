@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from omsm_ros import seconds
 from omsm_ros.cli import at_work as module
 from omsm_ros.cli.at_work import at_work
 
@@ -32,7 +33,7 @@ def terminal(monkeypatch):
     def made(patience=0.02):
         monkeypatch.setattr(sys, "stderr", Terminal())
         monkeypatch.setattr(module, "_PATIENCE_S", patience)
-        monkeypatch.setattr(module, "_TICK_S", 0.01)
+        monkeypatch.setattr(seconds, "_TICK_S", 0.01)
         return sys.stderr
 
     return made

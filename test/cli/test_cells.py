@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.command_line import parser_of
 from omsm_ros.cli.words import WORDS
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration

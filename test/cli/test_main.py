@@ -211,6 +211,25 @@ def test_only_what_is_asked_for_is_loaded(word, modules):
         assert not loaded & {"scipy", "rosbags", "matplotlib"}
 
 
+@pytest.mark.parametrize(
+    "loading", ["omsm_ros.cli.command_line", "omsm_ros.cli.inspecting", "numpy"]
+)
+def test_ctrl_c_while_a_command_loads_is_one_line(loading):
+    block = (
+        "import os, signal, sys\n"
+        "class Typed:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {loading!r}:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Typed())\n"
+        "from omsm_ros.cli import main\n"
+        "sys.exit(main(['inspect', 'none.mcap']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "omsm: interrupted; no unfinished file was left\n"
+
+
 def test_the_help_of_the_command_is_named_where_its_arguments_are_wrong(capsys):
     assert cli.main(["history", "--no-such-option"]) == 2
     assert "see 'omsm history --help'" in capsys.readouterr().err

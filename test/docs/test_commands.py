@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
-from omsm_ros.cli.main import parser_of
+from omsm_ros.cli.command_line import parser_of
 from omsm_ros.cli.words import WORDS
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent

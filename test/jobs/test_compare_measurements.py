@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from omsm_ros.cli.main import BAD_INPUT, DONE, main
+from omsm_ros.cli import main
+from omsm_ros.cli.command_line import BAD_INPUT, DONE
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.jobs.measure import measure
 from omsm_ros.storage import bags

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from omsm_ros.cli.main import main
+from omsm_ros.cli import main
 from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.surface.freeforms import ZernikeSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR

@@ -8,7 +8,8 @@ import struct
 import numpy as np
 import pytest
 
-from omsm_ros.cli.main import BAD_INPUT, DONE, main
+from omsm_ros.cli import main
+from omsm_ros.cli.command_line import BAD_INPUT, DONE
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.errors import FileError
 from omsm_ros.jobs.export_points import AS_MAP, AS_POINTS, export

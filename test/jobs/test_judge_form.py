@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from omsm_ros.cli.main import main
+from omsm_ros.cli import main
 from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.surface.freeforms import ZernikeSurface

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from omsm_ros.cli.main import main
+from omsm_ros.cli import main
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import Sphere

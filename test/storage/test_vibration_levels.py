@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from omsm_ros.cli.main import main
+from omsm_ros.cli import main
 from omsm_ros.core.samples.blocks import AccelerationBlock
 from omsm_ros.core.spectra.running_spectrum import MonitorOptions, RunningSpectrum
 from omsm_ros.errors import BagError

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omsm_ros import __version__, quantities
+from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
 from omsm_ros.cli.words import TASKS, WORDS
@@ -23,7 +24,7 @@ from omsm_ros.storage import strict_json
 if TYPE_CHECKING:  # it would load what reads bags, for a list of words
     from omsm_ros.cli.command import Command
 
-DONE, BAD_INPUT, DEFECT, INTERRUPTED = 0, 2, 70, 130  # 70 is EX_SOFTWARE of sysexits.h
+DONE, BAD_INPUT, DEFECT = 0, 2, 70  # 70 is EX_SOFTWARE of sysexits.h
 
 _WIDTH, _INDENT = 79, 14
 
@@ -51,7 +52,8 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
 
 def _command(word: str) -> Command:
     """Return the command ``word``; nothing is loaded but what its module needs."""
-    module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
+    with interruptible():
+        module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
     return next(command for command in module.COMMANDS if command.name == word)
 
 
@@ -155,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(str(err))
         return BAD_INPUT
     except KeyboardInterrupt:
-        _say("interrupted; no unfinished file was left")
+        _say(INTERRUPTION)
         return INTERRUPTED
     except BrokenPipeError:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
