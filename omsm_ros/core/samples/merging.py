@@ -17,8 +17,8 @@ from omsm_ros.units import NANOSECONDS_PER_S
 B = TypeVar("B", AxisBlock, DistanceBlock)
 AnyBlock = TypeVar("AnyBlock", bound=Block)
 
-MOST_TOGETHER = 500
-"""Samples: longer blocks cost little less a sample; queues keep room for the messages they make."""
+MOST_TOGETHER = 100
+"""Samples, as a driver's block has: each place in a queue keeps room for its longest message."""
 
 # Stamps within one block are those of its first sample and the period; they are moved no further.
 _STAMP_TOLERANCE_S = 1e-3

@@ -55,9 +55,9 @@ def test_single_samples_become_one_block() -> None:
 def test_no_more_than_so_many_samples_become_one_block() -> None:
     """A node that had stood still publishes no cloud of minutes."""
     z = np.arange(10_250.0) * 1e-6
-    blocks = merged(cut(z, [*range(0, 8001, 100), 10_000, 10_250]))
+    blocks = merged(cut(z, [*range(0, 8001, 20), 10_000, 10_250]))
     assert np.array_equal(np.concatenate([block.z for block in blocks]), z)
-    assert [len(block) for block in blocks] == [MOST_TOGETHER] * 16 + [2000, 250]
+    assert [len(block) for block in blocks] == [MOST_TOGETHER] * 80 + [2000, 250]
 
 
 @pytest.mark.parametrize("gap", ["count", "stamp", "period"])
