@@ -35,14 +35,16 @@ class CorrectionState:
         self.refusal = ""
         self.published = 0
         self.load = LoadMeter()
+        self.begins_at: dict[str, int] = {}
         self._heard = dict.fromkeys(_STREAMS, 0)
         self._period = dict.fromkeys(_STREAMS, 0.0)
         self._flows = {stream: Flow() for stream in _STREAMS}
         self._recent = RecentIncrease()
         self._oldest_ns = 0
 
-    def heard(self, stream: str, samples: int, period: float) -> None:
-        """Note a block, whatever becomes of it."""
+    def heard(self, stream: str, first: int, samples: int, period: float) -> None:
+        """Note a block, whatever becomes of it; first: its trigger number."""
+        self.begins_at.setdefault(stream, first)
         self._heard[stream] += samples
         self._period[stream] = period
 
@@ -61,6 +63,7 @@ class CorrectionState:
         report = Report("correcting", {"clouds_published": self.published})
         for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
             report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
+        report.values |= {f"begins_at_{name}": first for name, first in self.begins_at.items()}
         self._add_starved(report, now)
         if corrector is None:
             report.add(WARN, "no calibration: nothing is published")

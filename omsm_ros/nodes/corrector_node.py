@@ -169,7 +169,9 @@ class CorrectorNode(ManagedNode):
 
     def _take(self, stream: str, message: Any, info: MessageInfo) -> None:
         samples = len(message.z if stream == "axes" else message.distance)
-        self._state.heard(stream, samples, message.sample_period)
+        if stream not in self._state.begins_at:
+            self.get_logger().info(f"{stream}: begins at trigger {message.first_sample}")
+        self._state.heard(stream, message.first_sample, samples, message.sample_period)
         self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples

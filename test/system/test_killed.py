@@ -66,7 +66,9 @@ def test_a_killed_corrector_goes_on_where_it_comes_back(cell, true_calibration, 
     cell.settle("corrector", "axes_received")
     received = {stream: cell.closed_account(stream) for stream in ("axes", "distance")}
     assert min(received.values()) > 0
-    # From its first sample on none is missing; two streams are found a moment apart.
+    # It says where it came in; from there on none is missing. Streams are found a moment apart.
+    for stream, count in received.items():
+        assert cell.operator.value("corrector", f"begins_at_{stream}") + count == SCAN
     assert cell.operator.value("corrector", "missing_axes") == 0
     assert cell.operator.value("corrector", "missing_distance") == 0
     assert cell.operator.value("corrector", "axes_corrected") > 0
