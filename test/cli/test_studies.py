@@ -50,6 +50,19 @@ def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
     assert found["message"].endswith(found["left_out"])
 
 
+def test_predict_judges_at_the_period_of_the_longest_run(capsys, tmp_path, small_scan, calibration):
+    """The last block is of another sample period; it says nothing of those before."""
+    path, made = tmp_path / "two.mcap", list(blocks_of(small_scan, 1000))
+    made[-1] = (replace(made[-1][0], sample_period=4e-3), made[-1][1])
+    with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
+        for axes, _ in made:
+            bag.write_axes(axes)
+    found = facts(capsys, "predict", path, "--calibration", calibration)
+    truth = (small_scan.probe_motion - small_scan.axes.z)[: -len(made[-1][0])]
+    assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
+    assert "period" in found["left_out"]
+
+
 def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
     assert cli.main(["plan", "steps", "--out", str(tmp_path), "--json"]) == 0
     capsys.readouterr()

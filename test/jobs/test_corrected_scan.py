@@ -160,7 +160,7 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
     assert done.sample_period == 1e-3
 
 
-@pytest.mark.parametrize("samples", [1, 10])
+@pytest.mark.parametrize("samples", [1, 10, 100, 400])
 def test_a_probe_whose_counter_is_off_takes_the_green_away(
     tmp_path, small_scan_blocks, true_calibration, samples
 ):

@@ -45,10 +45,11 @@ def test_a_second_run_replaces_all_of_the_first_and_nothing_else(tmp_path):
     assert held(tmp_path / "out") == {"cloud": "2", "summary": "2", "notes.txt": "mine"}
 
 
-def test_a_refused_run_leaves_the_first_as_it_was(tmp_path):
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_refused_or_interrupted_run_leaves_the_first_as_it_was(tmp_path, error):
     put(tmp_path / "out", "1")
-    with pytest.raises(ValueError, match="no"):
-        broken(tmp_path / "out", ValueError("no"))
+    with pytest.raises(error, match="no"):
+        broken(tmp_path / "out", error("no"))
     assert held(tmp_path / "out") == dict.fromkeys(NAMES, "1")
 
 
