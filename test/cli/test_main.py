@@ -217,6 +217,7 @@ def test_only_what_is_asked_for_is_loaded(word, modules):
 def test_ctrl_c_while_a_command_loads_is_one_line(loading):
     block = (
         "import os, signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "class Typed:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         f"        if name == {loading!r}:\n"
