@@ -13,8 +13,8 @@ from omsm_ros.devices.command_port import CommandPort
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples
 from omsm_ros.devices.stream import UNREADABLE_S, StreamDevice
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import NoSamplesError
-from omsm_ros.protocols.micro_epsilon import BlockDecoder
+from omsm_ros.errors import DeviceError, NoSamplesError
+from omsm_ros.protocols.micro_epsilon import HEADERS, Block, BlockDecoder
 
 COUNTER_RANGE = 2**32
 # Begins the blocks of controllers whose heads do not say what the frames hold.
@@ -49,6 +49,7 @@ class BlockStreamDevice(StreamDevice):
         counting = Counting(COUNTER_RANGE, timed=False, period=period)
         super().__init__(transport, settings, channels, counting, now_ns, monotonic)
         self._decoder = BlockDecoder(kind, self._frame)
+        self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
         self._unread, self._undescribed = 0, False
         self._commands, self._answers_within = commands, patience
         self._identity: dict[str, str] = {}
@@ -72,16 +73,33 @@ class BlockStreamDevice(StreamDevice):
             self._identity = self._set_up(port)
 
     def _decode(self, data: bytes) -> Samples:
+        samples = self._converted(self._decoder.feed(data))
+        self._unread = 0 if len(samples) else self._unread + len(data)
+        self._undescribed = not len(samples) and (self._undescribed or _UNDESCRIBED in data)
+        return samples
+
+    def _ahead(self) -> float:
+        """A block counts when the next one has begun, of which frames have come, too."""
+        waiting = self._decoder.statistics.bytes_pending - self._head_bytes
+        return max(waiting, 0) / self._frame_bytes
+
+    def _rest(self) -> Samples:
+        return self._converted(self._decoder.settle())
+
+    def _converted(self, blocks: list[Block]) -> Samples:
         parts = []
-        for block in self._decoder.feed(data):
+        for block in blocks:
             self._identity = {
                 "order": str(block.order), "serial": str(block.serial), **self._identity,
             }  # fmt: skip
+            self._frame_bytes = block.frames.shape[1]
             frames = block.frames.reshape(-1).view(self._frame(block.kind))
             counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
-            parts.append(self._samples_of(frames, counter))
-        self._unread = 0 if parts else self._unread + len(data)
-        self._undescribed = not parts and (self._undescribed or _UNDESCRIBED in data)
+            try:
+                parts.append(self._samples_of(frames, counter))
+            except DeviceError:
+                self._decoder.reset()  # what waits is no better
+                raise
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _listen_in(self, silent: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -15,11 +15,14 @@ from omsm_ros.errors import DeviceError, DeviceTimeoutError
 from omsm_ros.protocols.chrocodile import Answer
 from omsm_ros.protocols.chrocodile_packet import (
     CONFIGURED,
+    DATA_BODY,
     ERROR,
+    HEADER,
     QUERY,
     UPDATE,
     Command,
     Data,
+    Message,
     Value,
     encode_command,
 )
@@ -43,7 +46,7 @@ class ChrocodilePacketDevice(Chrocodile):
     ) -> None:
         super().__init__(transport, settings, now_ns, monotonic)
         self._decoder = PacketDecoder()
-        self._ticket = 0
+        self._ticket, self._sample_bytes = 0, 1
         self._early: list[Data] = []
         self._commands: list[Command] = []
         self._said = b""
@@ -113,8 +116,11 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _receive(self, data: bytes) -> list[Data]:
         """Return the samples in ``data``; commands are kept apart."""
+        return self._sorted(self._decoder.feed(data))
+
+    def _sorted(self, messages: Sequence[Message]) -> list[Data]:
         found = []
-        for message in self._decoder.feed(data):
+        for message in messages:
             if isinstance(message, Command):
                 self._commands.append(message)
             elif isinstance(message, Data):
@@ -123,17 +129,30 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _decode(self, data: bytes) -> Samples:
         early, self._early = self._early, []
-        parts = [self._samples(message) for message in [*early, *self._receive(data)]]
+        return self._joined([*early, *self._receive(data)])
+
+    def _ahead(self) -> float:
+        """A packet counts when the next one has begun, of which samples have come, too."""
+        waiting = self._decoder.statistics.bytes_pending - HEADER.size - DATA_BODY.size
+        return max(waiting, 0) / self._sample_bytes
+
+    def _rest(self) -> Samples:
+        return self._joined(self._sorted(self._decoder.settle()))
+
+    def _joined(self, measured: Sequence[Data]) -> Samples:
+        parts = [self._samples(message) for message in measured]
         self._commands.clear()  # updates nobody asked for
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _samples(self, message: Data) -> Samples:
         self._signals = tuple(number for number, _, _ in message.format.signals)
         if missing := set(self._selection) - set(self._signals):
+            self._decoder.reset()  # what waits is no better
             raise DeviceError(
                 f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
                 f"sends {self._signals!r}; choose signals that it has"
             )
+        self._sample_bytes = message.format.dtype.itemsize
         samples = self._convert(message.records)
         samples["time"] = message.times_ns
         return samples

@@ -81,7 +81,7 @@ class StreamDevice:
         self._cutter = BlockCutter(settings, channels)
         self._decoded = 0
         self._heard = self._opened = monotonic()
-        self._came_ns = 0  # when the last bytes did
+        self._came_ns, self._came_at = 0, self._heard  # when the last bytes did
         self._down = False
         self._renewals = 0
 
@@ -100,7 +100,8 @@ class StreamDevice:
         """
         data = self._transport.read(timeout)
         arrival_ns, now = self._now_ns(), self._monotonic()
-        self._came_ns = arrival_ns if data or not self._came_ns else self._came_ns
+        if data or not self._came_ns:
+            self._came_ns, self._came_at = arrival_ns, now
         samples = self._decode(data)
         silent = now - self._heard
         if len(samples):
@@ -180,7 +181,7 @@ class StreamDevice:
         raise NotImplementedError
 
     def _rest(self) -> Samples:
-        """Return a sample that was complete, but waited for what follows it; shape (n,)."""
+        """Return samples that were complete, but waited for what follows them; shape (n,)."""
         return np.empty(0, SAMPLE)
 
     def _ahead(self) -> float:
@@ -214,7 +215,9 @@ class StreamDevice:
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
         """Return everything that waited, now that nothing follows."""
-        rest = self._rest()
-        blocks = self._add(rest, self._came_ns or arrival_ns, 0.0) if len(rest) else []
+        rest, blocks = self._rest(), []
+        if len(rest):
+            silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
+            blocks = self._add(rest, self._came_ns or arrival_ns, silent)
         blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)
         return [*blocks, *self._cutter.flush()]

@@ -182,9 +182,7 @@ class LineDecoder:
             self._synchronised = True
         self._kept += sum(len(line) + 1 for line, fit in zip(good, fits, strict=True) if fit)
         self._telegrams += len(values)
-        if len(tail) > MAX_TELEGRAM_BYTES:
-            tail, self._synchronised = b"", False
-        self._tail = tail
+        self._tail = tail[:MAX_TELEGRAM_BYTES]  # so long, it is no line already
         return self._records(values)
 
     def settle(self) -> Records:
@@ -202,7 +200,7 @@ class LineDecoder:
         )
 
     def _well_formed(self, line: bytes) -> bool:
-        return len(line) <= MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
+        return len(line) < MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
 
     def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
         """Return which rows of ``values`` (n, signals) their types can hold, shape (n,)."""

@@ -47,7 +47,11 @@ class PacketStatistics:
 
 
 class PacketDecoder:
-    """Bytes in any portions → messages; nothing raises, memory is one packet and a portion."""
+    """Bytes in any portions → messages; nothing raises, memory is one packet and a portion.
+
+    Messages are a function of the bytes alone, however they were cut. So samples wait until
+    the next packet has begun, or for :meth:`settle`; commands and formats do not.
+    """
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -79,6 +83,17 @@ class PacketDecoder:
         self._buffer = self._buffer[start:]
         return found
 
+    def settle(self) -> list[Message]:
+        """Return the packet that waited for what follows it, now that nothing does."""
+        size = len(self._buffer)
+        if not (self._buffer.startswith(MAGIC_BYTES) and self._length(0, last=True) == size):
+            return []
+        found: list[Message] = []
+        waiting: list[tuple[bytes, int, int]] = []
+        self._buffer = self._buffer[self._open(0, size, found, waiting) :]
+        self._flush(found, waiting)
+        return found
+
     @property
     def statistics(self) -> PacketStatistics:
         """Return what became of every byte."""
@@ -91,30 +106,40 @@ class PacketDecoder:
             unformatted=self._unformatted,
         )
 
-    def _length(self, place: int) -> int | None:
-        """Return the length of the packet at ``place``; 0 = it is none; None = not all here yet."""
+    def _length(self, place: int, *, last: bool = False) -> int | None:
+        """Return the length of the packet at ``place``; 0 = it is none; None = wait for more.
+
+        last: nothing follows it
+        """
         if place + HEADER.size > len(self._buffer):
             return None
+        length: int
         _, length, kind = HEADER.unpack_from(self._buffer, place)
-        if kind not in KINDS or not HEADER.size < length <= MAX_PACKET_BYTES:
+        if not _is_head(length, kind) or self._cut_off(place, place + length, kind):
             return 0
-        after = self._buffer[place + length :][: len(MAGIC_BYTES)]
+        end = place + length
+        if end > len(self._buffer):
+            return None
+        after = self._buffer[end : end + len(MAGIC_BYTES)]
+        if kind != DATA or after == MAGIC_BYTES or (last and not after):
+            return length
         # Samples have no check of their own; what follows shows whether they are too many or few.
-        ends = kind != DATA or MAGIC_BYTES.startswith(after)
-        if self._cut_off(place, length) or not ends:
-            return 0
-        return length if place + length <= len(self._buffer) else None
+        return None if MAGIC_BYTES.startswith(after) else 0
 
-    def _cut_off(self, place: int, length: int) -> bool:
-        """Return whether the next packet begins inside the one at ``place``: its end is missing."""
-        end = place + length + len(MAGIC_BYTES) - 1  # it may also begin in the last bytes
-        inside = self._buffer.find(MAGIC_BYTES, place + 4, end)
-        while inside >= 0 and inside + HEADER.size <= len(self._buffer):
-            _, size, kind = HEADER.unpack_from(self._buffer, inside)
-            if kind in KINDS and HEADER.size < size <= MAX_PACKET_BYTES:
+    def _cut_off(self, place: int, end: int, kind: int) -> bool:
+        """Return whether the next packet begins inside the one up to ``end``: its end is missing.
+
+        What cannot be told from the bytes before ``end`` is not: bytes that are not here yet
+        must not change the answer. Only samples wait for what follows them; in the end of the
+        others the magic alone counts.
+        """
+        inside = self._buffer.find(MAGIC_BYTES, place + len(MAGIC_BYTES), end)
+        while 0 <= inside <= len(self._buffer) - HEADER.size and inside <= end - HEADER.size:
+            _, size, other = HEADER.unpack_from(self._buffer, inside)
+            if _is_head(size, other):
                 return True
             inside = self._buffer.find(MAGIC_BYTES, inside + 1, end)
-        return False
+        return kind != DATA and inside > end - HEADER.size
 
     def _open(
         self, place: int, length: int, found: list[Message], waiting: list[tuple[bytes, int, int]]
@@ -175,6 +200,10 @@ class PacketDecoder:
         within = np.arange(len(records)) - np.repeat(np.cumsum(counts) - counts, counts)
         waiting.clear()
         found.append(Data(form, records, starts + _after(form, records, within)))
+
+
+def _is_head(length: int, kind: int) -> bool:
+    return kind in KINDS and HEADER.size < length <= MAX_PACKET_BYTES
 
 
 def _after(form: DataFormat, records: Records, within: NDArray[np.int64]) -> NDArray[np.int64]:

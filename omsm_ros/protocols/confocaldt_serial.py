@@ -80,11 +80,13 @@ class SerialDecoder:
         marks[_VALUE_BYTES - 1] = HIGH_FIRST
         self._marks = marks.astype(np.uint8)
         self._buffer = b""
+        self._passed_over = False  # bytes since the last frame that begin none
         self._received = self._frames = self._malformed = 0
 
     def reset(self) -> None:
         """Forget an unfinished frame, as after connecting anew."""
         self._buffer = b""
+        self._passed_over = False
 
     def feed(self, data: bytes) -> tuple[IntArray, IntArray]:
         """Return values (n, width) of the frames completed by ``data``, and how many were spoilt.
@@ -95,13 +97,16 @@ class SerialDecoder:
         self._received += len(data)
         raw = np.frombuffer(self._buffer + data, np.uint8)
         starts = self._starts(raw)
-        place = 0
         spoilt = np.zeros(len(starts), np.int64)
-        spoilt[:] = np.diff(starts, prepend=place - self._size) != self._size
-        rest = int(starts[-1]) + self._size if len(starts) else 0
+        spoilt[:] = np.diff(starts, prepend=-self._size) != self._size
+        rest = 0
+        if len(starts):
+            spoilt[0] |= self._passed_over
+            rest, self._passed_over = int(starts[-1]) + self._size, False
         tail = raw[rest:]
         if len(tail) >= self._size:  # no frame in it: only its end may still become one
             tail = tail[len(tail) - self._size + 1 :]
+            self._passed_over = True
         self._buffer = tail.tobytes()
         self._frames += len(starts)
         self._malformed += int(spoilt.sum())

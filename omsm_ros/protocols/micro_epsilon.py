@@ -143,7 +143,11 @@ class BlockStatistics:
 
 
 class BlockDecoder:
-    """Bytes in any portions → blocks; nothing raises, memory is one block and a portion."""
+    """Bytes in any portions → blocks; nothing raises, memory is one block and a portion.
+
+    Blocks are a function of the bytes alone, however they were cut. So a block waits until the
+    next one has begun, or for :meth:`settle`: bytes lost or added inside it show there.
+    """
 
     def __init__(self, form: str, dtype_of: Callable[[tuple[int, int]], np.dtype[np.void]]) -> None:
         """form: of HEADERS;  dtype_of: what frames hold, or ProtocolError."""
@@ -178,6 +182,15 @@ class BlockDecoder:
         self._buffer = self._buffer[start:]
         return found
 
+    def settle(self) -> list[Block]:
+        """Return the block that waited for what follows it, now that nothing does."""
+        size = len(self._buffer)
+        if self._find(0) != 0 or self._size(0, last=True) != size:
+            return []
+        found = self._block(0, size)
+        self._buffer = b""
+        return [found]
+
     @property
     def statistics(self) -> BlockStatistics:
         """Return what became of every byte."""
@@ -193,17 +206,26 @@ class BlockDecoder:
         places = [self._buffer.find(preamble, start) for preamble in PREAMBLES]
         return min((place for place in places if place >= 0), default=-1)
 
-    def _size(self, place: int) -> int | None:
-        """Return the bytes of the block at ``place``; 0 = it is none; None = not all here yet."""
+    def _size(self, place: int, *, last: bool = False) -> int | None:
+        """Return the bytes of the block at ``place``; 0 = it is none; None = wait for more.
+
+        last: nothing follows it
+        """
         if place + self._header.size > len(self._buffer):
             return None
         shape = self._shape(self._header.unpack_from(self._buffer, place))
         if shape is None:
             return 0
         size = self._header.size + shape[0] * shape[1]
-        if size > MAX_BLOCK_BYTES or self._cut_off(place, size):
+        end = place + size
+        if size > MAX_BLOCK_BYTES or self._cut_off(place, end):
             return 0
-        return size if place + size <= len(self._buffer) else None
+        if end > len(self._buffer):
+            return None
+        after = self._buffer[end : end + len(PREAMBLES[0])]
+        if after in PREAMBLES or (last and not after):
+            return size
+        return None if any(preamble.startswith(after) for preamble in PREAMBLES) else 0
 
     def _shape(self, fields: tuple[int, ...]) -> tuple[int, int] | None:
         """Frames, and bytes of each, whichever of the two stands first; None if neither fits."""
@@ -215,14 +237,10 @@ class BlockDecoder:
         count = first if second == width else second if first == width else 0
         return (count, width) if count else None
 
-    def _cut_off(self, place: int, size: int) -> bool:
-        """Return whether another block begins inside the one at ``place``, or none at its end."""
-        end = place + size
-        after = self._buffer[end:][: len(PREAMBLES[0])]
-        if not any(preamble.startswith(after) for preamble in PREAMBLES):
-            return True
+    def _cut_off(self, place: int, end: int) -> bool:
+        """Return whether another block's head stands inside the one up to ``end``."""
         inside = self._find(place + 1)
-        while 0 <= inside < end and inside + self._header.size <= len(self._buffer):
+        while 0 <= inside <= min(end, len(self._buffer)) - self._header.size:
             if self._shape(self._header.unpack_from(self._buffer, inside)) is not None:
                 return True
             inside = self._find(inside + 1)

@@ -42,6 +42,12 @@ def data(first: int, count: int, form: DataFormat = FORMAT) -> bytes:
     return encode_data(form, records, first * 1_000_000)
 
 
+def decoded(wire: bytes, decoder: PacketDecoder | None = None) -> list[Message]:
+    """What is in ``wire``, which nothing follows."""
+    decoder = decoder or PacketDecoder()
+    return decoder.feed(wire) + decoder.settle()
+
+
 def counters(found: list[Message]) -> list[int]:
     return [int(c) for m in found if isinstance(m, Data) for c in m.records["83"]]
 
@@ -62,7 +68,7 @@ def test_a_data_format_and_its_data_by_hand() -> None:
     form = head + struct.pack("<Iifi", 0, 9, 4000.0, 1) + signal
     body = struct.pack("<IiQi", 0, 9, 5 * 2**32 + 2**31, 2) + struct.pack("<ff", 1.5, -2.5)
     packet = struct.pack("<IiQI", 0xAA55AA55, 20 + len(body), 0, 0x00544144) + body
-    described, measured = PacketDecoder().feed(form + packet)
+    described, measured = decoded(form + packet)
     assert described == DataFormat(9, 4000.0, ((256, 6, 1),))
     assert isinstance(measured, Data)
     assert measured.records["256"].tolist() == [1.5, -2.5]
@@ -80,7 +86,7 @@ def test_a_triggered_sample_tells_its_own_time() -> None:
     form = DataFormat(1, 1000.0, ((91, 5, 1), (83, 2, 1)))
     records = np.zeros(2, form.dtype)
     records["91"] = [2**30, 2**31 - 1]
-    found = PacketDecoder().feed(encode_format(form) + encode_data(form, records, 10**9))
+    found = decoded(encode_format(form) + encode_data(form, records, 10**9))
     assert isinstance(found[1], Data)
     np.testing.assert_allclose(found[1].times_ns, [1_250_000_000, 1_500_000_000], atol=1)
 
@@ -112,6 +118,7 @@ def test_any_split_gives_the_same_messages(
     found = []
     for a, b in zip([0, *cuts], [*cuts, len(wire)], strict=True):
         found += decoder.feed(wire[a:b])
+    found += decoder.settle()
     assert found[0] == asked
     assert counters(found) == list(range(7))
     assert decoder.statistics.bytes_discarded == 0
@@ -121,14 +128,32 @@ def test_byte_by_byte() -> None:
     wire = encode_format(FORMAT) + data(0, 50) + encode_command(Command("CONF")) + data(50, 50)
     decoder = PacketDecoder()
     found = [m for i in range(len(wire)) for m in decoder.feed(wire[i : i + 1])]
-    assert counters(found) == list(range(100))
+    assert counters(found) == list(range(50))  # what follows the others has not come
+    assert counters(found + decoder.settle()) == list(range(100))
+    assert decoder.settle() == []
+
+
+def test_what_is_not_whole_does_not_settle() -> None:
+    decoder = PacketDecoder()
+    wire = encode_format(FORMAT) + data(0, 5)
+    decoder.feed(wire[:-3])
+    assert decoder.settle() == []
+    assert counters(decoded(wire[-3:], decoder)) == list(range(5))
+
+
+def test_samples_that_bytes_were_added_to_are_none() -> None:
+    wire = bytearray(data(0, 5) + data(5, 5) + data(10, 5))
+    wire[60:60] = b"\x07\x08"
+    decoder = PacketDecoder()
+    decoder.feed(encode_format(FORMAT))
+    assert counters(decoded(bytes(wire), decoder)) == list(range(5, 15))
 
 
 @given(st.binary(max_size=300))
 def test_after_any_garbage_the_next_packet_but_one_is_decoded(noise: bytes) -> None:
     decoder = PacketDecoder()
     decoder.feed(encode_format(FORMAT))
-    found = decoder.feed(noise + data(0, 5) + data(5, 5))
+    found = decoded(noise + data(0, 5) + data(5, 5), decoder)
     assert counters(found)[-5:] == [5, 6, 7, 8, 9]
 
 
@@ -140,7 +165,7 @@ def test_a_packet_cut_off_does_not_swallow_the_next(place: int, lost: int) -> No
     assume(lost != len(parts[0]))  # the end of one packet then fits the beginning of another
     decoder = PacketDecoder()
     decoder.feed(encode_format(FORMAT))
-    found = counters(decoder.feed(wire[:place] + wire[place + lost :]))
+    found = counters(decoded(wire[:place] + wire[place + lost :], decoder))
     size = len(parts[0])
     before = [c for i in range(5) for c in range(10 * i, 10 * i + 10) if (i + 1) * size <= place]
     after = [c for i in range(5) for c in range(10 * i, 10 * i + 10) if i * size >= place + lost]
@@ -164,9 +189,9 @@ def test_noise_and_mutations_raise_nothing(portions: list[bytes], place: int, va
 
 def test_data_of_an_unknown_format_are_counted() -> None:
     decoder = PacketDecoder()
-    assert decoder.feed(data(0, 5)) == []
+    assert decoded(data(0, 5), decoder) == []
     decoder.feed(encode_format(DataFormat(8, 1000.0, FORMAT.signals)))
-    assert decoder.feed(data(0, 5)) == []
+    assert counters(decoded(data(0, 5), decoder)) == []
     assert decoder.statistics.unformatted == 10
 
 

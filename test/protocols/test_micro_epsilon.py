@@ -54,10 +54,16 @@ def counters(found: list[Block]) -> list[int]:
 # Blocks, by hand.
 
 
+def decoded(sent: bytes, made: BlockDecoder | None = None) -> list[Block]:
+    """What is in ``sent``, which nothing follows."""
+    made = made or decoder()
+    return made.feed(sent) + made.settle()
+
+
 @pytest.mark.parametrize("preamble", [b"MEAS", b"SAEM"])
 def test_a_confocal_block_by_hand(preamble: bytes) -> None:
     head = preamble + struct.pack("<IIIIHHI", 1, 2, *FLAGS, 1, 16, 77)
-    (found,) = decoder().feed(head + struct.pack("<iIiI", -5, 77, 123_456, 512))
+    (found,) = decoded(head + struct.pack("<iIiI", -5, 77, 123_456, 512))
     assert (found.order, found.serial, found.counter) == (1, 2, 77)
     frame = found.frames.reshape(-1).view(DTYPE)[0]
     assert [frame[n].item() for n in ("encoder 1", "counter", "distance 1", "intensity 1")] == [
@@ -68,7 +74,7 @@ def test_a_confocal_block_by_hand(preamble: bytes) -> None:
 def test_a_capacitive_block_by_hand() -> None:
     head = b"MEAS" + struct.pack("<IIQIHHI", 1, 2, 0b010001, 0, 2, 8, 9)
     made = BlockDecoder("capacitive", lambda kind: channel_dtype(kind[0]))
-    (found,) = made.feed(head + struct.pack("<4i", 1, 2, 3, 4))
+    (found,) = decoded(head + struct.pack("<4i", 1, 2, 3, 4), made)
     frames = found.frames.reshape(-1).view(channel_dtype(0b010001))
     assert frames.dtype.names == ("channel 1", "channel 3")
     assert frames["channel 3"].tolist() == [2, 4]
@@ -77,10 +83,10 @@ def test_a_capacitive_block_by_hand() -> None:
 def test_numbers_of_frames_and_of_bytes_stand_in_either_order() -> None:
     head = b"SAEM" + struct.pack("<IIQIHHI", 1, 2, 0b0101, 0, 8, 3, 9)
     made = BlockDecoder("capacitive", lambda kind: channel_dtype(kind[0]))
-    (found,) = made.feed(head + struct.pack("<6i", *range(6)))
+    (found,) = decoded(head + struct.pack("<6i", *range(6)), made)
     assert found.frames.shape == (3, 8)
     assert found.counter == 9
-    assert made.feed(head[:-8] + struct.pack("<HHI", 7, 3, 9) + bytes(24)) == []
+    assert decoded(head[:-8] + struct.pack("<HHI", 7, 3, 9) + bytes(24), made) == []
 
 
 NO_PEAK = 0x7FFFFF04
@@ -127,6 +133,7 @@ def test_any_split_gives_the_same_blocks(sizes: list[int], data: st.DataObject) 
     found = []
     for a, b in zip([0, *cuts], [*cuts, len(sent)], strict=True):
         found += made.feed(sent[a:b])
+    found += made.settle()
     assert counters(found) == list(range(firsts[-1]))
     assert made.statistics.bytes_discarded == 0
 
@@ -134,14 +141,28 @@ def test_any_split_gives_the_same_blocks(sizes: list[int], data: st.DataObject) 
 def test_byte_by_byte() -> None:
     sent = wire(0, 30) + wire(30, 30)
     made = decoder()
-    assert counters([b for i in range(len(sent)) for b in made.feed(sent[i : i + 1])]) == list(
-        range(60)
-    )
+    found = [b for i in range(len(sent)) for b in made.feed(sent[i : i + 1])]
+    assert counters(found) == list(range(30))  # what follows the others has not come
+    assert counters(found + made.settle()) == list(range(60))
+    assert made.settle() == []
+
+
+def test_what_is_not_whole_does_not_settle() -> None:
+    made, sent = decoder(), wire(0, 5)
+    made.feed(sent[:-3])
+    assert made.settle() == []
+    assert counters(decoded(sent[-3:], made)) == list(range(5))
+
+
+def test_a_block_that_bytes_were_added_to_is_none() -> None:
+    sent = bytearray(wire(0, 5) + wire(5, 5) + wire(10, 5))
+    sent[60:60] = b"\x07\x08"
+    assert counters(decoded(bytes(sent))) == list(range(5, 15))
 
 
 @given(st.binary(max_size=300))
 def test_after_any_garbage_the_next_block_but_one_is_decoded(noise: bytes) -> None:
-    found = counters(decoder().feed(noise + wire(0, 5) + wire(5, 5)))
+    found = counters(decoded(noise + wire(0, 5) + wire(5, 5)))
     assert found[-5:] == [5, 6, 7, 8, 9]
 
 
@@ -150,7 +171,7 @@ def test_lost_bytes_invent_nothing(place: int, lost: int) -> None:
     """Shorter than a block: one as long fits the beginning of another."""
     sent = b"".join(wire(5 * i, 5) for i in range(5))
     place = min(place, len(sent) - 1)
-    found = decoder().feed(sent[:place] + sent[place + lost :])
+    found = decoded(sent[:place] + sent[place + lost :])
     whole = {b.frames.tobytes() for b in (block(5 * i, 5) for i in range(5))}
     assert all(b.frames.tobytes() in whole for b in found)
 
