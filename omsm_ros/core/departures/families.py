@@ -174,13 +174,15 @@ class Departures:
             for damping in _DAMPINGS
             for frequency in _geometric(lowest, max(highest, 2 * lowest), 2 * damping)
         ]
+        # Mode by mode: a long record's spectra of all would be a gigabyte.
+        rows = np.empty((2 * len(ladder), len(self.problem.input)))
+        for place, (frequency, damping) in enumerate(ladder):
+            s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
+            mode = self._answer / (1 + 2 * damping * s + s * s)
+            for row, spectrum in enumerate((mode - self._answer, s * mode), 2 * place):
+                rows[row] = self._in_time(spectrum)
         frequencies, dampings = np.array(ladder).T
-        omega = 2 * np.pi * frequencies[:, np.newaxis]
-        s = self.problem.s * self.problem.rate / omega
-        mode = self._answer / (1 + 2 * dampings[:, np.newaxis] * s + s * s)
-        spectra = np.stack([mode - self._answer, s * mode], axis=1).reshape(-1, s.shape[1])
-        columns = self._in_time(spectra)
-        return Family(MODE, frequencies, len(ladder) / 2, columns, dampings)
+        return Family(MODE, frequencies, len(ladder) / 2, rows.T, dampings)
 
     def vibration(self) -> Family:
         """Return the sine and cosine at the strongest lines of the residual."""
@@ -241,9 +243,14 @@ class Departures:
         trials = _OVERLAP * len(cycles)
         if near is not None:
             cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
-        angles = 2 * np.pi * answer[:, np.newaxis] / travel * cycles
-        columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(len(answer), -1)
-        return Family(PERIODIC, np.asarray(travel / cycles), trials, columns)
+        angle = 2 * np.pi * answer / travel
+        # The cycles are evenly spaced, so each is the one before, turned by the same angle.
+        turned, step = np.exp(1j * cycles[0] * angle), np.exp(1j * (cycles[1] - cycles[0]) * angle)
+        rows = np.empty((2 * len(cycles), len(answer)))
+        for row in range(0, len(rows), 2):
+            rows[row], rows[row + 1] = turned.imag, turned.real
+            turned *= step
+        return Family(PERIODIC, np.asarray(travel / cycles), trials, rows.T)
 
     def friction(self) -> Iterator[Family]:
         """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""

@@ -83,10 +83,11 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
 
     drift: columns of the background that model a drift
     """
-    survey = with_slower_creep(survey)
-    relaxations = [_hidden(survey, judged) for judged in survey.creep]
+    # Of relaxations alone: what the survey found of all else stands.
+    slow = with_slower_creep(survey)
+    relaxations = [_hidden(slow, judged) for judged in slow.creep]
     if drift:
-        other = without_drift(survey, drift).creep
+        other = without_drift(slow, drift).creep
         relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
     found = _worst(known, relaxation_found(survey.fitted.dynamics)) if known else []

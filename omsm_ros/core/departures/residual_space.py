@@ -65,9 +65,13 @@ class ResidualSpace:
     def _basis(self) -> FloatArray:
         return orthonormal(self.problem.sensitivity(self.fitted), _SPANNED)
 
+    def _compared(self, columns: FloatArray) -> FloatArray:
+        """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
+        return np.compress(self.problem.used, columns.T, axis=1).T
+
     def freed(self, columns: FloatArray) -> FloatArray:
         """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
-        compared = columns[self.problem.used]
+        compared = self._compared(columns)
         return np.asarray(compared - self._basis @ (self._basis.T @ compared))
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
@@ -75,7 +79,7 @@ class ResidualSpace:
 
         To find the best of many; :meth:`score` then judges it.
         """
-        compared = columns[self.problem.used]
+        compared = self._compared(columns)
         imitated = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
         moment = (compared.T @ self.fitted.residual).reshape(-1, terms)
         gram = np.empty((len(moment), terms, terms))
@@ -90,7 +94,7 @@ class ResidualSpace:
 
     def score(self, columns: FloatArray) -> Score:
         """Judge the term of ``columns`` (n, c), all its coefficients together."""
-        compared = columns[self.problem.used]
+        compared = self._compared(columns)
         freed = self.freed(columns)
         before = np.linalg.norm(compared, axis=0)
         free = np.linalg.norm(freed, axis=0) > _IMITATED * np.where(before > 0, before, 1.0)
