@@ -10,13 +10,12 @@ from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from typing import Any, TypeVar
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes.diagnostics import survive
-from omsm_ros.nodes.running import refuse
+from omsm_ros.nodes.running import Paced, refuse
 from omsm_ros.nodes.topics import REQUESTS_QOS
 
 T = TypeVar("T")
@@ -33,7 +32,6 @@ class Aside:
     def __init__(self, node: Node, undo: ExitStack) -> None:
         self._node = node
         self._work: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
-        self._group = ReentrantCallbackGroup()
         self.waiting = 0
         threading.Thread(target=self._run, daemon=True).start()
         undo.callback(self._work.put, None)
@@ -71,8 +69,9 @@ class Aside:
                 refuse(response, survive(self._node, err))
             return response
 
+        group = Paced(self._node, undo)
         made = self._node.create_service(
-            kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=self._group
+            kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group
         )
         undo.callback(self._node.destroy_service, made)
 

@@ -16,6 +16,8 @@ from contextlib import ExitStack
 from typing import Any
 
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -33,6 +35,8 @@ _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
 _PATIENCE_S = 5.0
 # For a log message of a node that cannot start to reach who listens on /rosout.
 _LAST_WORDS_S = 1.0
+# Between two requests of one service: a client that is held up for ten of them loses nothing.
+_PACE_S = 0.01
 
 
 def run(make_node: Callable[[], ManagedNode]) -> None:
@@ -143,6 +147,38 @@ def settings_of(text: str) -> dict[str, object]:
     return strict_json.object_of(text, ConfigurationError, "parameter 'settings'")
 
 
+class Paced(ReentrantCallbackGroup):  # type: ignore[misc]
+    """Lets a service take one request after the other, a moment apart.
+
+    Requests wait in the node's own queue, which is deep. A client's holds ten answers by default:
+    of hundreds that come in one go it would lose most, and wait for them for ever.
+    """
+
+    def __init__(self, node: Node, undo: ExitStack) -> None:
+        super().__init__()
+        self._ready = True
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._pause = node.create_timer(_PACE_S, self._go_on, clock=steady)
+        self._pause.cancel()
+        undo.callback(node.destroy_timer, self._pause)
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether the next request may be taken; asked by the executor, as the other."""
+        return self._ready
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Begin the pause."""
+        if not self._ready:
+            return False
+        self._ready = False
+        self._pause.reset()
+        return True
+
+    def _go_on(self) -> None:
+        self._pause.cancel()
+        self._ready = True
+
+
 def serve(
     node: Node, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], None]
 ) -> None:
@@ -160,7 +196,8 @@ def serve(
             refuse(response, survive(node, err))
         return response
 
-    made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS)
+    group = Paced(node, undo)
+    made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group)
     undo.callback(node.destroy_service, made)
 
 

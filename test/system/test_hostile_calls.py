@@ -4,10 +4,12 @@ import array
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
+from rclpy.qos import QoSProfile
 
 from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.storage import conversions
@@ -65,6 +67,23 @@ def test_hostile_calls_are_answered_and_survived(cell, files):
     for node in ("corrector", "calibrator"):
         assert cell.operator.value(node, "defects") == 0
     cell.processes.check()
+
+
+def test_answers_come_no_faster_than_a_client_fetches_them(cell):
+    """A client holds ten answers by default; of two hundred in one go it would lose most."""
+    cell.processes.start("calibrator", output=str(cell.folder / "new.json"))
+    # Deeper than the default, for this process may be held up for longer than ten answers take.
+    deep = QoSProfile(depth=100)
+    client = cell.operator.create_client(Identify, "/omsm/calibrator/identify", qos_profile=deep)
+    cell.wait("the service", client.service_is_ready)
+    cell.settle("calibrator", "requests_waiting")
+    asked = [Identify.Request(order=99 if k % 2 else 2) for k in range(200)]
+    begin = time.monotonic()
+    futures = [client.call_async(request) for request in asked]
+    cell.wait("all answers", lambda: all(future.done() for future in futures))
+    assert time.monotonic() - begin > 199 * 0.01
+    for k, future in enumerate(futures):
+        assert ("order is 99" if k % 2 else "0 axis blocks") in future.result().message
 
 
 def hostile_calibrations(good):
