@@ -72,6 +72,7 @@ class CorrectionState:
         report.values["stamp_skew_s"] = corrector.stamp_skew
         slip = corrector.slips.state
         report.values |= {"slip_samples": slip.samples, "slip_seen_from_samples": slip.seen_from}
+        report.values["pairs_held"] = corrector.held
         if slip.samples:
             report.add(ERROR, f"not corrected: {slip}")
         report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}

@@ -9,6 +9,7 @@ the last bit, live and offline.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -175,6 +176,7 @@ class Corrector:
             for run in self._motion.end():
                 self._pairing.axes.push(run)
         self._join()
+        self._correct(self._pairing.end())
         for queue in (self._pairing.axes, self._pairing.distance):
             queue.clear()
         for intake in (self._axes, self._distance):
@@ -185,9 +187,10 @@ class Corrector:
     def account(self) -> Account:
         """Where every sample received so far has gone."""
         warming = self._motion.pending if self._motion else 0
+        axes, distance = self._pairing.axes, self._pairing.distance
         return Account(
-            axes=self._axes.tally.snapshot(self._pairing.axes.pending + warming),
-            distance=self._distance.tally.snapshot(self._pairing.distance.pending),
+            axes=self._axes.tally.snapshot(axes.pending + axes.held + warming),
+            distance=self._distance.tally.snapshot(distance.pending + distance.held),
         )
 
     @property
@@ -197,6 +200,11 @@ class Corrector:
         Large or drifting, it is a sign of devices that count different triggers.
         """
         return self._pairing.stamp_skew
+
+    @property
+    def held(self) -> int:
+        """Pairs that wait for stamps to show that their equal counts are one trigger [samples]."""
+        return self._pairing.axes.held
 
     @property
     def slips(self) -> SlipWatch:
@@ -241,7 +249,10 @@ class Corrector:
         return MotionFilter(*filters, blend=blend)
 
     def _join(self) -> None:
-        for axes, distance in self._pairing.pairs():
+        self._correct(self._pairing.pairs())
+
+    def _correct(self, pairs: Iterable[tuple[Run, Run]]) -> None:
+        for axes, distance in pairs:
             points = self._points(axes, distance)
             if len(points):
                 self._ready.append(points)

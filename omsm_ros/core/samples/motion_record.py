@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -204,7 +205,7 @@ class _Grid:
         for run in _runs(blocks, _reading, intake):
             pairing.distance.push(run)
         seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
-        for axis, reading in pairing.pairs():
+        for axis, reading in chain(pairing.pairs(), pairing.end()):
             place = slice(axis.first - self.first, axis.end - self.first)
             usable = reading.reasons == Reason.NONE
             seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable

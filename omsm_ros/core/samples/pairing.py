@@ -123,13 +123,14 @@ class Intake:
 class Queue:
     """Runs of one stream that wait for a partner.
 
+    pending: samples without one;  held: in pairs that are not settled yet
     given_up: the newest samples that waited too long
     stamps: of the blocks they came in
     """
 
     def __init__(self, tally: Tally, stamps: StampLine) -> None:
         self.stamps = stamps
-        self.pending = 0
+        self.pending = self.held = 0
         self.given_up: Run | None = None
         self._runs: deque[Run] = deque()
         self._tally = tally
@@ -151,14 +152,23 @@ class Queue:
         self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
         return run
 
-    def pair(self, samples: int, partner_reasons: NDArray[np.uint8]) -> Run:
-        """Take the oldest ``samples`` of the head, whose partners have these reasons."""
-        run = self._cut(samples)
+    def hold(self, samples: int) -> Run:
+        """Take the oldest ``samples`` of the head, which have partners; settle or refuse them."""
+        self.held += samples
+        return self._cut(samples)
+
+    def settle(self, run: Run, partner_reasons: NDArray[np.uint8]) -> None:
+        """Enter a run that was held, whose partners have these reasons."""
+        self.held -= len(run)
         if run.reasons.any() or partner_reasons.any():
             self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
         else:
-            self._tally.count(Reason.NONE, samples)
-        return run
+            self._tally.count(Reason.NONE, len(run))
+
+    def refuse(self, run: Run) -> None:
+        """Enter a run that was held, and whose partners are of other triggers."""
+        self.held -= len(run)
+        self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(Reason.SLIPPED)))
 
     def limit(self, samples: int) -> None:
         """Give the oldest up until no more than ``samples`` wait."""
@@ -202,6 +212,7 @@ class Pairing:
         self.stamp_skew: float | None = None
         self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
         self._link = _Link(-1, -1)
+        self._held: deque[tuple[Run, Run]] = deque()
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
         """Yield complete runs of axes and distance, of equal count and length."""
@@ -216,21 +227,36 @@ class Pairing:
             else:
                 yield from self._joined(a, d)
 
+    def end(self) -> Iterator[tuple[Run, Run]]:
+        """Yield the pairs that still wait to be settled, as far as stamps can tell; none follow."""
+        if self._held:
+            yield from self._settle(self._held[-1][0].end, self.watch.end())
+
     def _joined(self, a: Run, d: Run) -> Iterator[tuple[Run, Run]]:
-        """Yield the pairs that two heads of equal count make, but for those that have slipped."""
+        """Yield the pairs that two heads of equal count settle; theirs may have to wait."""
         self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
-        start, end = 0, a.first + min(len(a), len(d))
-        for until, slipped in self.watch.spans((a.session, d.session), a.first, end, a.period_ns):
-            stop = until - a.first
+        sessions, first, samples = (a.session, d.session), a.first, min(len(a), len(d))
+        if sessions != self.watch.sessions:
+            yield from self.end()
+        self._held.append((self.axes.hold(samples), self.distance.hold(samples)))
+        for until, slipped in self.watch.settled(sessions, first, first + samples, a.period_ns):
+            yield from self._settle(until, slipped)
+
+    def _settle(self, until: int, slipped: bool) -> Iterator[tuple[Run, Run]]:
+        """Yield the pairs that waited before the count ``until``, but for those that slipped."""
+        while self._held and (first := self._held[0][0].first) < until:
+            a, d = self._held.popleft()
+            if until < a.end:
+                stop = until - first
+                self._held.appendleft((a.part(stop, len(a)), d.part(stop, len(d))))
+                a, d = a.part(0, stop), d.part(0, stop)
             if slipped:
-                self.axes.drop(stop - start, Reason.SLIPPED)
-                self.distance.drop(stop - start, Reason.SLIPPED)
+                self.axes.refuse(a)
+                self.distance.refuse(d)
             else:
-                yield (
-                    self.axes.pair(stop - start, d.reasons[start:stop]),
-                    self.distance.pair(stop - start, a.reasons[start:stop]),
-                )
-            start = stop
+                self.axes.settle(a, d.reasons)
+                self.distance.settle(d, a.reasons)
+                yield a, d
 
     def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
         """Return samples of ``run`` before the other head, all of them if the sessions differ."""

@@ -10,6 +10,10 @@ over the last half minute, whichever is larger: a driver's clock wanders while i
 has still to learn is larger than that, and taken from how it moves: the mean of n arrivals moves by
 1/n of their scatter with the next, and is wrong by 1/√n of it, so by √n times what it moves.
 
+Until then nothing is shown: a pair waits until stamps that agree have come after it, from both
+streams, at the start until the first verdict, and where a stamp is off until a verdict on what
+came after it. Blocks of one driver carry the same stamps to the nanosecond, and wait for nothing.
+
 Every decision rests on the stamps of blocks up to that count alone, so live and offline agree.
 """
 
@@ -23,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.scatter import SIGMA_OF_MAD
+from omsm_ros.core.samples.scatter import median, spread_about_median
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
@@ -36,6 +40,8 @@ _FIRST_S = 1.0
 _SPAN_S, _STRIDE_S = 0.8, 0.2
 # Stamps of either stream that a verdict needs; of long blocks they span more than a second.
 _LEAST_STAMPS = 8
+# One or two at the end cost the pairs that they are of, but show no slip.
+_SURE_STAMPS = 3
 # Over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
 # Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
@@ -67,6 +73,11 @@ class CommonTrigger:
         COUNTER_OFFSET.checked(self.counter_offset, ConfigurationError, "counter_offset")
         STAMP_TOLERANCE.checked(self.stamp_tolerance, ConfigurationError, "stamp_tolerance")
 
+
+# One driver's stamps of one trigger, rounded twice, differ by no more than this [ns].
+_SAME_NS = 2.0
+# Pairs wait no longer than this for the first verdict: blocks are too long for one [s].
+_MOST_WAIT_S = 10.0
 
 EQUAL_COUNTS = CommonTrigger()
 
@@ -135,6 +146,23 @@ class SlipWatch:
         self.found: Slip | None = None
         self._restart((-1, -1), 0)
 
+    def _restart(self, sessions: tuple[int, int], first: int) -> None:
+        self._sessions, self._start = sessions, first
+        self._state = Slip()
+        self._judged, self._since, self._period_ns = -1, 0.0, 1.0
+        # Nothing was judged yet; whether one driver stamps both, once any stamp was seen.
+        self._starting, self._common = True, False
+        # Of each stream: stamps seen, and the last block that began where stamps agree.
+        self._stamps, self._shown = [0, 0], [first, first]
+        # Up to where a verdict found none, in spite of stamps that are off; the last of those.
+        self._judged_to, self._odd_at = first, -math.inf
+        # Whether any stamp since the last verdict is off enough: without one no median is.
+        self._odd = False
+        # Of each stamp: count, skew [ns], whether it is of the axes, of the distance, axes' time.
+        self._seen: deque[tuple[int, float, bool, bool, float]] = deque(maxlen=_MOST_STAMPS)
+        # Skew at each stride of the last half minute without a slip [ns].
+        self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
+
     @property
     def state(self) -> Slip:
         """What the stamps said last."""
@@ -143,31 +171,59 @@ class SlipWatch:
         window = self._window()
         return Slip() if window is None else Slip(seen_from=math.ceil(self._limit(window)))
 
-    def spans(
+    @property
+    def sessions(self) -> tuple[int, int]:
+        """Of axes and distance, whose pairs are watched."""
+        return self._sessions
+
+    def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
     ) -> Iterator[tuple[int, bool]]:
-        """Yield the end, and whether they slipped, of spans of pairs from ``first`` to ``end``."""
+        """Watch the pairs from ``first`` to ``end``, which go on with those before.
+
+        Yield up to which count all those that still wait are settled, and whether they slipped.
+        """
         if sessions != self._sessions:
             self._restart(sessions, first)
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
             before = self._state.samples
-            self._observe(count, period_ns)
-            if bool(self._state.samples) != bool(before) and count > first:
+            if self._common:
                 yield count, bool(before)
-        yield end, bool(self._state.samples)
+            self._observe(count, period_ns)
+            if before or self._state.samples:
+                yield count, True
+                self._shown = [count, count]
+            else:
+                yield self._agreed(count, period_ns), False
+        stamped = all(
+            line.stamp_of(session, first, period_ns) is not None
+            for line, session in zip(self._lines, sessions, strict=True)
+        )
+        if self._common or self._state.samples or not stamped:
+            yield end, bool(self._state.samples)
 
-    def _restart(self, sessions: tuple[int, int], first: int) -> None:
-        self._sessions, self._start = sessions, first
-        self._state = Slip()
-        self._judged, self._since, self._period_ns = -1, 0.0, 1.0
-        # Whether any stamp since the last verdict is off enough: without one no median is.
-        self._odd = False
-        # Of each stamp: count, skew [ns], whether it is of the axes, of the distance, axes' time.
-        self._seen: deque[tuple[int, float, bool, bool, float]] = deque(maxlen=_MOST_STAMPS)
-        # Skew at each stride of the last half minute without a slip [ns].
-        self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
+    def end(self) -> bool:
+        """Return whether the pairs that still wait slipped, as far as it can be told."""
+        since = self._start - 1 if self._starting else min(self._shown)
+        few = self._starting and min(self._stamps) < _LEAST_STAMPS
+        if self._state.samples or self._odd_at <= since or few or not self._in_real_time():
+            return bool(self._state.samples)
+        rows = np.array([seen for seen in self._seen if seen[0] > since])
+        found = self._verdict(_skews(rows, self._period_ns))
+        if found.samples and len(rows) >= _SURE_STAMPS:
+            self._state = self.found = found
+        return bool(found.samples)
+
+    def _agreed(self, count: int, period_ns: float) -> int:
+        """Return up to where stamps have shown that there is no slip."""
+        per_s = NANOSECONDS_PER_S / period_ns
+        if self._starting and count - self._start <= _MOST_WAIT_S * per_s:
+            return self._start
+        self._starting = False
+        odd = count - self._odd_at <= _SPAN_S * per_s
+        return self._judged_to if odd else max(min(self._shown), self._judged_to)
 
     def _next(self, end: int) -> int:
         pairs = zip(self._lines, self._sessions, strict=True)
@@ -176,44 +232,77 @@ class SlipWatch:
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self._sessions
-        of_axes, of_distance = axes.advance(a, count), distance.advance(d, count)
+        begun = axes.advance(a, count), distance.advance(d, count)
         late, early = axes.stamp_of(a, count, period_ns), distance.stamp_of(d, count, period_ns)
-        per_s = NANOSECONDS_PER_S / period_ns
         if late is None or early is None:
+            self._common = False
             return
+        skew, per_s = late - early, NANOSECONDS_PER_S / period_ns
+        self._period_ns = period_ns
+        self._note(count, skew, begun)
         stride = int(count // max(_STRIDE_S * per_s, 1.0))
         judged, self._judged = self._judged, stride
         early_days = count - self._start < _FIRST_S * per_s
         if stride != judged:
             if not early_days:
-                self._since, self._period_ns = count - _SPAN_S * per_s, period_ns
-                self._judge()
+                self._since = count - _SPAN_S * per_s
+                self._judge(count)
             if not self._state.samples:
-                self._wander.append(late - early)
-        if not early_days:
-            self._seen.append((count, late - early, of_axes, of_distance, late))
-            self._odd |= abs(late - early) >= self._steady(period_ns) * period_ns
+                self._wander.append(skew)
+        self._seen.append((count, skew, *begun, late))
+        self._odd |= self._is_off(skew) and not early_days
 
-    def _judge(self) -> None:
-        if not (self._odd or self._state.samples):
+    def _note(self, count: int, skew: float, begun: tuple[bool, bool]) -> None:
+        """Keep what one stamp shows, of the streams whose blocks have ``begun`` there."""
+        first = not any(self._stamps)
+        self._common = abs(skew) <= _SAME_NS and (first or self._common)
+        for stream in np.flatnonzero(begun):
+            self._stamps[stream] += 1
+            if not self._is_off(skew):
+                self._shown[stream] = count
+        if self._is_off(skew):
+            self._odd_at = count
+
+    def _is_off(self, skew: float) -> bool:
+        return abs(skew) >= self._steady(self._period_ns) * self._period_ns
+
+    def _judge(self, count: int) -> None:
+        if not (self._odd or self._state.samples or self._starting):
             return
-        window = self._window()
-        self._state = Slip() if window is None else self._verdict(window)
-        self._odd = window is None or bool(np.any(abs(window) >= self._steady(self._period_ns)))
-        self.found = self._state if self._state.samples else self.found
+        rows = self._recent()
+        if rows is None:
+            self._state, self._odd = Slip(), True
+        elif not self._in_real_time():
+            self._state, self._odd = Slip(), True
+            self._starting, self._judged_to = False, count  # stamps tell nothing
+        else:
+            window = _skews(rows, self._period_ns)
+            self._state = self._verdict(window)
+            self._starting, self._judged_to = False, int(rows[0, 0])
+            self._odd = bool(np.any(abs(window) >= self._steady(self._period_ns)))
+            self.found = self._state if self._state.samples else self.found
 
-    def _window(self) -> FloatArray | None:
-        """Return the skews to be judged [samples], None if they say nothing."""
+    def _recent(self) -> FloatArray | None:
+        """Return the stamps to be judged, as in ``_seen`` (n, 5); None if they are too few."""
         seen = np.array(self._seen, np.float64).reshape(-1, 5)
+        first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
+        seen = seen[np.searchsorted(seen[:, 0], first) :]
         starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
         if min(map(len, starts)) < _LEAST_STAMPS:
             return None
         since = int(np.searchsorted(seen[:, 0], self._since))
-        oldest = min(since, *(int(s[-_LEAST_STAMPS]) for s in starts))
-        seen = seen[oldest:]
-        if not _in_real_time(seen[:, 0] * self._period_ns, seen[:, 4]):
-            return None
-        return np.asarray(seen[:, 1] / self._period_ns)
+        return seen[min(since, *(int(s[-_LEAST_STAMPS]) for s in starts)) :]
+
+    def _in_real_time(self) -> bool:
+        """Return whether stamps [ns] advance about as the counts do."""
+        (first, *_, began), (last, *_, ended) = self._seen[0], self._seen[-1]
+        elapsed, passed = (last - first) * self._period_ns, ended - began
+        return elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed
+
+    def _window(self) -> FloatArray | None:
+        """Return the skews to be judged [samples], None if they say nothing."""
+        rows = self._recent()
+        return None if rows is None or not self._in_real_time() else _skews(rows, self._period_ns)
 
     def _steady(self, period_ns: float) -> float:
         """Return the skew of stamps without scatter that is a slip [samples]."""
@@ -222,11 +311,13 @@ class SlipWatch:
     def _limit(self, window: FloatArray) -> float:
         """Return the skew that is a slip [samples]."""
         wander = np.array(self._wander) / self._period_ns
-        scatter = max(_spread(window), _spread(wander), _to_be_learnt(wander))
+        scatter = max(
+            spread_about_median(window), spread_about_median(wander), _to_be_learnt(wander)
+        )
         return self._steady(self._period_ns) + _SEVERAL_TIMES * scatter
 
     def _verdict(self, window: FloatArray) -> Slip:
-        skew, limit = _median(window), self._limit(window)
+        skew, limit = median(window), self._limit(window)
         slipped = abs(skew) >= (self._steady(self._period_ns) if self._state.samples else limit)
         if not slipped:
             return Slip()
@@ -248,22 +339,9 @@ def _to_be_learnt(wander: FloatArray) -> float:
     """Return by how much clocks that moved as in ``wander`` (n,) may still be wrong."""
     if len(wander) <= 2:
         return 0.0
-    return _END_OF_LINE * _spread(np.diff(wander)) * math.sqrt(len(wander))
+    return _END_OF_LINE * spread_about_median(np.diff(wander)) * math.sqrt(len(wander))
 
 
-def _in_real_time(counted: FloatArray, stamped: FloatArray) -> bool:
-    """Return whether stamps [ns] advance about as the counts do [ns]."""
-    elapsed = float(counted[-1] - counted[0])
-    passed = float(stamped[-1] - stamped[0])
-    return elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median; of so few values numpy's own takes ten times as long."""
-    ordered, half = np.sort(values), len(values) // 2
-    return float(ordered[half] + ordered[-1 - half]) / 2
-
-
-def _spread(values: FloatArray) -> float:
-    """Return the standard deviation of normal values, little moved by others among them."""
-    return SIGMA_OF_MAD * _median(abs(values - _median(values)))
+def _skews(rows: FloatArray, period_ns: float) -> FloatArray:
+    """Return the skews [samples] of stamps (n, 5)."""
+    return np.asarray(rows[:, 1] / period_ns)

@@ -73,6 +73,7 @@ class Joined:
     distance: list[int] = field(default_factory=list)
     slips: list[int] = field(default_factory=list)
     seen_from: int | None = None
+    held: list[int] = field(default_factory=list)
     accounts: tuple[StreamAccount, StreamAccount] = (StreamAccount(), StreamAccount())
     watch: SlipWatch | None = None
 
@@ -112,6 +113,11 @@ def join(
             done.axes += [int(v) for v in a.values[0]]
             done.distance += [int(v) for v in d.values[0]]
         done.slips.append(pairing.watch.state.samples)
+        done.held.append(queues[0].held)
+    for a, d in pairing.end():
+        done.axes += [int(v) for v in a.values[0]]
+        done.distance += [int(v) for v in d.values[0]]
+    assert queues[0].held == queues[1].held == 0
     for queue in queues:
         queue.clear()
     accounts = [intake.tally.snapshot(0) for intake in intakes]
@@ -143,7 +149,8 @@ def test_missed_triggers_are_found_within_a_second(
     lacking = without(ALL, at, missed)
     a, d = (lacking, ALL) if who == "axes" else (ALL, lacking)
     done = join(Device(a, jitter=jitter).blocks(), Device(d, jitter=jitter, seed=1).blocks())
-    assert np.all((done.wrong >= at) & (done.wrong < at + missed + 1000))
+    # With stamps as equal as one driver's, what is left of the block is paired already.
+    assert len(done.wrong) <= (50 if jitter is None else 0)
     assert done.slips[-1] == (missed if who == "axes" else -missed)
     assert done.slipped == 6000 - missed - len(done.axes) > 1500
     assert done.watch is not None
@@ -151,11 +158,11 @@ def test_missed_triggers_are_found_within_a_second(
 
 
 @pytest.mark.parametrize("late", [1, 10, 300])
-def test_a_counter_that_was_started_late_is_found_within_two_seconds(late: int) -> None:
+def test_nothing_is_paired_with_a_counter_that_was_started_late(late: int) -> None:
     done = join(Device(ALL).blocks(), Device(ALL[late:]).blocks())
-    assert len(done.wrong) <= 2000
+    assert done.axes == []
     assert done.slips[-1] == -late
-    assert done.slipped > 3500
+    assert done.slipped == 6000 - late
 
 
 @pytest.mark.parametrize("late", [1, 10, 300])
@@ -185,7 +192,7 @@ def test_a_device_that_begins_anew_alone_is_never_paired_wrongly_for_long(who: i
         *Device(ALL[2500:]).blocks(),
     ]
     done = join(restarted if who == 0 else whole, whole if who == 0 else restarted)
-    assert len(done.wrong) <= 2000
+    assert len(done.wrong) == 0
     assert done.axes[:2000] == list(range(2000))
 
 
@@ -236,8 +243,10 @@ def test_arrivals_uneven_by_20_ms_raise_no_alarm_while_clocks_learn(seed: int) -
 def test_two_samples_are_found_within_a_second_of_uneven_arrivals(seed: int) -> None:
     axes = Device(ALL[:5000], jitter=1e-3, seed=seed)
     probe = Device(without(ALL[:5000], 3000, 2), jitter=1e-3, seed=seed + 999)
-    wrong = join(axes.blocks(), probe.blocks()).wrong
-    assert 0 < len(wrong) <= 1000
+    done = join(axes.blocks(), probe.blocks())
+    assert len(done.wrong) == 0
+    assert done.slips.index(-2) * 50 / 2 < 3000 + 1000
+    assert len(done.axes) + done.slipped == 4998
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -254,8 +263,8 @@ def test_at_70_khz_it_says_what_it_cannot_tell(seed: int) -> None:
     lacking = Device(without(number, 140_000, 700), 1400, period, jitter=1e-3, seed=seed + 99)
     found = join(axes.blocks(), lacking.blocks())
     assert found.slips[-1] == pytest.approx(-700, abs=35)
-    assert found.wrong.min() >= 140_000
-    assert found.wrong.max() < 140_700 + 70_000
+    assert len(found.wrong) == 0
+    assert 140_000 - 70_000 < len(found.axes) <= 140_000
 
 
 def test_blocks_of_one_sample_and_of_other_lengths() -> None:
@@ -265,7 +274,7 @@ def test_blocks_of_one_sample_and_of_other_lengths() -> None:
     assert len(done.axes) == 3000
     slipped = join(Device(number, 1).blocks(), Device(without(number, 1500, 1), 70).blocks())
     assert slipped.slips[-1] == -1
-    assert slipped.wrong.max() < 2501
+    assert len(slipped.wrong) <= 70
 
 
 def test_one_long_block_or_no_stamps_tell_nothing() -> None:
