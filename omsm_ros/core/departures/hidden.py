@@ -36,9 +36,11 @@ _DECADES = 3.0
 # What creeps within the record creeps on beyond it, about as much in each of three decades from
 # none to all: a uniform distribution, whose standard deviation is 1/√3 of its end.
 _UNSEEN = _DECADES / 3**0.5
-# A joint or a piezo goes on creeping for half a minute and longer, whatever a record lasts. Of what
-# is slower than two records hardly more than a bend shows, which any drift could be.
-_SLOWEST_CREEP_S, _MOST_RECORDS = 30.0, 2.0
+# A joint or a piezo goes on creeping for minutes, whatever a record lasts. Of what is slower than
+# ten records not even its beginning shows.
+_SLOWEST_CREEP_S, _MOST_RECORDS = 100.0, 10.0
+# Of the background: the drift that every fit has.
+_STEADY_DRIFT = slice(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +88,8 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
     # Of relaxations alone: what the survey found of all else stands.
     slow = with_slower_creep(survey)
     relaxations = [_hidden(slow, judged) for judged in slow.creep]
-    if drift:
-        other = without_drift(slow, drift).creep
+    for gone in _taken_for_noise(drift):
+        other = without_drift(slow, gone).creep
         relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
     found = _worst(known, relaxation_found(survey.fitted.dynamics)) if known else []
@@ -100,8 +102,14 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
     return found
 
 
+def _taken_for_noise(drift: Sequence[slice]) -> list[Sequence[slice]]:
+    """Return which drifts to take for noise: the steady one, the bent one, and both."""
+    steady = [_STEADY_DRIFT]
+    return [steady, drift, [*steady, *drift]] if drift else [steady]
+
+
 def with_slower_creep(survey: Survey) -> Survey:
-    """Return ``survey`` with relaxations up to half a minute, or as slow as this record is long."""
+    """Return ``survey`` with relaxations of minutes, or as slow as this record is long."""
     slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / survey.departures.duration)
     return replace(survey, slower=max(slower, 1.0))
 
@@ -110,7 +118,8 @@ def without_drift(survey: Survey, drift: Sequence[slice]) -> Survey:
     """Return ``survey`` with the drift that was modelled taken for noise of the readings.
 
     Columns of any size let a drift of a micrometre undo a relaxation of as much. One that
-    wanders by nanometres cannot, and as noise it is no larger than it was found to be.
+    wanders by nanometres cannot, and as noise it is no larger than it was found to be. A slow
+    relaxation itself looks like a steady drift: where there is none, there is no relaxation.
     """
     fitted, problem = survey.fitted, survey.problem
     gone = np.zeros(problem.background.shape[1], np.bool_)
@@ -131,7 +140,8 @@ def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
     size, uncertainty = float(other.score.size[0]), other.score.uncertainty
     if not np.hypot(size, uncertainty) < term.carried:
         return term
-    return replace(term, size=size, uncertainty=uncertainty, missed=_missed(other))
+    # The alarm is that of the fit, which lets the drift be as large as it likes.
+    return replace(term, size=size, uncertainty=uncertainty)
 
 
 def _worst(relaxations: list[HiddenTerm], found: float) -> list[HiddenTerm]:
