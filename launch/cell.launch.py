@@ -47,8 +47,9 @@ def cell(context: LaunchContext) -> list[Node]:
     driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
     nodes = []
     if given["emulated"] == "true":
-        played, driver = twin(given["namespace"], given["device"] or "six_channel")
+        played, driver, beside = twin(given["namespace"], given["device"] or "six_channel")
         nodes.append(node(given, "cell_emulator", played))
+        nodes += [node(given, name, parameters) for name, parameters in beside.items()]
     nodes += [
         node(given, "confocal_driver", driver),
         node(given, "calibrator", {}),
@@ -84,18 +85,25 @@ def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Nod
     )
 
 
-def twin(namespace: str, device: str) -> tuple[dict[str, object], dict[str, object]]:
-    """Parameters of the emulator, and of the driver that reads it."""
+Parameters = dict[str, object]
+
+
+def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str, Parameters]]:
+    """Parameters of the emulator, of the driver that reads it, and of the node beside that."""
     if device not in EMULATED:
         raise ValueError(f"device {device!r} has no emulator, expected one of {sorted(EMULATED)}")
-    port = str(runtime_folder(namespace) / "cell")
-    if EMULATED[device].tcp:
-        # Another one for each cell, else a second driver would read the first cell's device.
-        port = f"tcp://127.0.0.1:{7000 + crc32(namespace.strip('/').encode()) % 1000}"
-    return (
-        {"device": device, "link": port},
-        {"device": device, "port": port, **emulated(device).driver},
-    )
+    known = emulated(device)
+    serial = str(runtime_folder(namespace) / "cell")
+    # Another one for each cell, else a second driver would read the first cell's device.
+    tcp = f"tcp://127.0.0.1:{7000 + crc32(namespace.strip('/').encode()) % 1000}"
+    port = tcp if known.tcp else serial
+    played = {"device": device, "link": port}
+    driver = {"device": device, "port": port, **known.driver}
+    if known.beside is None:
+        return played, driver, {}
+    second = tcp if known.beside.tcp else f"{serial}_beside"
+    played["link_beside"] = second
+    return played, driver, {known.beside.node: {"port": second, **known.beside.driver}}
 
 
 def rviz(namespace: str) -> Node:

@@ -101,7 +101,7 @@ def _declare(word: str, sub: argparse.ArgumentParser) -> None:
 def _declare_demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
-    sub.add_argument("--time-lapse", type=lapse, default=20.0, help="times faster than real")
+    sub.add_argument("--time-lapse", type=lapse, help="times faster than real (20)")
     sub.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
     sub.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
     sub.add_argument("--view", action="store_true", help="show the scan in a browser")
@@ -131,8 +131,8 @@ def _demo(args: argparse.Namespace) -> int:
         return _experiment(args)
     # The demonstration runs real nodes, so it is one; ROS is imported only there.
     command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(args.out)]
-    command += ["--time-lapse", str(args.time_lapse), "--seed", str(args.seed)]
-    command += ["--device", args.device]
+    command += ["--device", args.device, "--seed", str(args.seed)]
+    command += ["--time-lapse", str(args.time_lapse)] if args.time_lapse else []
     command += ["--disturbances", args.disturbances] if args.disturbances else []
     command += ["--view"] if args.view else []
     return subprocess.call([*command, *(["--json"] if args.json else [])])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from omsm_ros.emulators.chrocodile import AXIS_SCALING, ChrocodileEmulator
@@ -12,7 +12,11 @@ from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
 from omsm_ros.emulators.csv_stream import CsvStreamEmulator
 from omsm_ros.emulators.generic_stream import Faults, GenericStreamEmulator
 from omsm_ros.emulators.instrument import Instrument, Line
-from omsm_ros.emulators.micro_epsilon import ConfocalDtEmulator
+from omsm_ros.emulators.micro_epsilon import (
+    CapaNcdtEmulator,
+    ConfocalDtEmulator,
+    ConfocalDtSerialEmulator,
+)
 from omsm_ros.emulators.pseudo_terminal import Pty
 from omsm_ros.emulators.sources import RecordingSource
 from omsm_ros.emulators.tcp_server import TcpServer
@@ -20,12 +24,16 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
 from omsm_ros.protocols.generic_stream import AXES, StreamScaling
 from omsm_ros.twin.cell import Probe, Recording
+from omsm_ros.twin.channels import ReferenceSensor
 from omsm_ros.units import MICROMETRE_M
 
 _TCP = "tcp://127.0.0.1:"
 _END_S = 5.0
 # The twin's probe measures about its middle, this one from the beginning of its range.
 _READING = ProbeReading(full_scale=100 * MICROMETRE_M, zero=Probe().half_range)
+_CAPACITIVE = ProbeReading(
+    full_scale=2 * ReferenceSensor().half_range_m, zero=ReferenceSensor().half_range_m
+)
 
 
 def line_for(link: str) -> Pty | TcpServer:
@@ -122,15 +130,61 @@ class InstrumentPlayer:
         self._thread.join(timeout=_END_S)
 
 
+class Together:
+    """Plays a motion on several devices of one trigger, on each what it measures of it."""
+
+    def __init__(self, *players: tuple[Player, Callable[[Recording], Recording]]) -> None:
+        self._players = players
+
+    @property
+    def playing(self) -> bool:
+        return any(player.playing for player, _ in self._players)
+
+    @property
+    def played(self) -> int:
+        return min(player.played for player, _ in self._players)
+
+    def start(self, recording: Recording, time_lapse: float) -> None:
+        parts = [(player, part(recording)) for player, part in self._players]
+        for player, measured in parts:
+            player.start(measured, time_lapse)
+
+    def halt(self) -> None:
+        for player, _ in self._players:
+            player.halt()
+
+    def close(self) -> None:
+        for player, _ in self._players:
+            player.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """A second device of the same trigger.
+
+    node: whose parameters ``driver`` are;  part: what it measures of a motion
+    player, tcp: as of the first one
+    """
+
+    node: str
+    player: Callable[[Line, Faults], Player]
+    driver: dict[str, object]
+    part: Callable[[Recording], Recording] = lambda recording: recording
+    tcp: bool = False
+
+
 @dataclass(frozen=True, slots=True)
 class Emulated:
     """player: makes it on a line;  driver: parameters a driver needs to read it;
-    tcp: it needs a TCP port, where others also work on a serial one.
+    tcp: it needs a TCP port, where others also work on a serial one;  beside: what else there is
+    baud_rate: its line has no more, so a demonstration is slow, and small [bit/s]; 0 = any
     """
 
     player: Callable[[Line, Faults], Player]
     driver: dict[str, object]
     tcp: bool = False
+    beside: Beside | None = None
+    baud_rate: int = 0
 
 
 def _chrocodile(line: Line, faults: Faults) -> Player:
@@ -150,6 +204,25 @@ def _confocaldt_ethernet(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(emulator)
 
 
+def _confocaldt(line: Line, faults: Faults) -> Player:
+    emulator = ConfocalDtSerialEmulator(
+        line, triggered=True, seed=faults.seed, probe=_READING, width=3
+    )
+    return InstrumentPlayer(emulator)
+
+
+def _capancdt(line: Line, faults: Faults) -> Player:
+    emulator = CapaNcdtEmulator(line, triggered=True, seed=faults.seed, probe=_CAPACITIVE)
+    return InstrumentPlayer(emulator)
+
+
+def _reference(recording: Recording) -> Recording:
+    """The motion as a reference sensor measures it."""
+    if recording.reference is None:
+        raise ConfigurationError("this motion has no reference; add `reference` to disturbances")
+    return replace(recording, distance=recording.reference)
+
+
 def _csv(line: Line, faults: Faults) -> Player:
     return InstrumentPlayer(CsvStreamEmulator(line, triggered=True, seed=faults.seed))
 
@@ -167,11 +240,35 @@ _OWN_ENCODERS: dict[str, object] = {
     for name, axis in zip(AXES, AXIS_SCALING, strict=True)
 }
 
+# RS-422 carries the distance alone, so the axes come from a device of their own.
+_AXES_BESIDE = Beside("axis_driver", StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES)
+_REFERENCE_BESIDE = Beside(
+    "reference_driver",
+    _capancdt,
+    {"device": "capancdt", "triggered": True, "probe.zero": _CAPACITIVE.zero},
+    _reference,
+    tcp=True,
+)
+
 EMULATED = {
     "six_channel": Emulated(StreamPlayer, _STREAM_SCALES),
     "six_channel_text": Emulated(_csv, _STREAM_SCALES),
     "chrocodile": Emulated(_chrocodile, _OWN_ENCODERS),
     "chrocodile_packet": Emulated(_chrocodile_packet, _OWN_ENCODERS, tcp=True),
+    "confocaldt": Emulated(
+        _confocaldt,
+        {
+            "signals": "distance intensity counter",
+            "trigger": "each",
+            "probe.zero": _READING.zero,
+        },
+        beside=_AXES_BESIDE,
+        baud_rate=691_200,
+    ),
+    # The capacitive reference beside the six-channel stream.
+    "capancdt": Emulated(
+        StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES, beside=_REFERENCE_BESIDE
+    ),
     # Y and B stand still in the twin's motions: three encoders are enough.
     "confocaldt_ethernet": Emulated(
         _confocaldt_ethernet, _OWN_ENCODERS | {"encoders": "XZC"}, tcp=True
@@ -184,3 +281,13 @@ def emulated(device: str) -> Emulated:
     if device not in EMULATED:
         raise ConfigurationError(f"device {device!r}, expected one of {sorted(EMULATED)}")
     return EMULATED[device]
+
+
+def player_for(device: str, line: Line, beside: Line | None, faults: Faults) -> Player:
+    """Return what plays motions on ``line``, and on the line ``beside`` it if there is one."""
+    known = emulated(device)
+    first = known.player(line, faults)
+    if known.beside is None or beside is None:
+        return first
+    second = known.beside.player(beside, faults)
+    return Together((first, lambda recording: recording), (second, known.beside.part))

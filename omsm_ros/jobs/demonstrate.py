@@ -56,6 +56,10 @@ _REST_SAMPLES = 100
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
 # Where an emulated device has to be on TCP: one of these ports of this machine.
 _FIRST_PORT, _PORTS = 20_000, 10_000
+# The paper's spiral, as fast as emulated lines carry it; nine bytes a sample over RS-422 at
+# 691 200 baud are 7.6 times faster than real at most, and of two devices one may lag behind.
+_LAPSE, _RADIUS_M = 20.0, 12.7e-3
+_SLOW_LAPSE, _SMALL_RADIUS_M = 3.0, 3e-3
 TITLE = "Paraboloid mirror measured on the emulated cell"
 
 
@@ -64,6 +68,7 @@ class Demonstration:
     """Where the results go, and how the twin is set.
 
     time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
+        None = as fast, and as large, as the device's line allows
     device: what the emulated probe speaks
     disturbance_file: what is wrong with the machine, None for nothing
     view: whether a browser may look on
@@ -71,8 +76,8 @@ class Demonstration:
 
     out: Path
     seed: int = 1
-    time_lapse: float = 20.0
-    start_radius: float = 12.7e-3
+    time_lapse: float | None = None
+    start_radius: float | None = None
     device: str = "six_channel"
     disturbance_file: Path | None = None
     view: bool = False
@@ -81,9 +86,19 @@ class Demonstration:
     @cached_property
     def scenario(self) -> Scenario:
         """What the emulated cell does."""
-        return Scenario(
-            seed=self.seed, start_radius=self.start_radius, sample_period=self.sample_period
-        )
+        return Scenario(seed=self.seed, start_radius=self.radius, sample_period=self.sample_period)
+
+    @property
+    def lapse(self) -> float:
+        """How much faster than real time the cell plays [1]."""
+        slow = emulated(self.device).baud_rate > 0
+        return self.time_lapse or (_SLOW_LAPSE if slow else _LAPSE)
+
+    @property
+    def radius(self) -> float:
+        """Of the start of the spiral [m]."""
+        slow = emulated(self.device).baud_rate > 0
+        return self.start_radius or (_SMALL_RADIUS_M if slow else _RADIUS_M)
 
     @cached_property
     def disturbances(self) -> Disturbances:
@@ -104,8 +119,15 @@ class Demonstration:
     def link(self) -> str:
         """The emulated port."""
         if emulated(self.device).tcp:
-            return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
+            return _tcp_link()
         return str((self.out / "cell").absolute())
+
+    @property
+    def link_beside(self) -> str:
+        """The emulated port of the second device; empty without one."""
+        if (beside := emulated(self.device).beside) is None:
+            return ""
+        return _tcp_link() if beside.tcp else f"{self.link}_beside"
 
     @property
     def step_test_samples(self) -> int:
@@ -121,9 +143,10 @@ class Demonstration:
         """Return ROS parameters of the emulator."""
         return {
             "device": self.device,
-            "time_lapse": self.time_lapse,
+            "link_beside": self.link_beside,
+            "time_lapse": self.lapse,
             "seed": self.seed,
-            "start_radius": self.start_radius,
+            "start_radius": self.radius,
             "sample_period": self.sample_period,
             "disturbances": str(self.disturbance_file.absolute()) if self.disturbance_file else "",
         }
@@ -133,13 +156,20 @@ class Demonstration:
         fixed = {"device": self.device, "port": self.link, "sample_period": self.sample_period}
         return fixed | emulated(self.device).driver
 
+    def beside_parameters(self) -> tuple[str, dict[str, object]] | None:
+        """Return the node that reads the second device, and its ROS parameters; None without."""
+        if (beside := emulated(self.device).beside) is None:
+            return None
+        fixed = {"port": self.link_beside, "sample_period": self.sample_period}
+        return beside.node, fixed | beside.driver
+
     def settings(self) -> dict[str, object]:
         """Return what the calibration will belong to."""
         return {
             "machine": "digital twin of the paper's cell",
             "fixture": "twin",
             "probe_rate_hz": 1 / self.sample_period,
-            "time_lapse": self.time_lapse,
+            "time_lapse": self.lapse,
             "seed": self.seed,
         }
 
@@ -171,6 +201,10 @@ class Demonstration:
         write_nominal(self.nominal_file)
         for log in (self.out / "log").glob("*.log"):
             log.unlink()
+
+
+def _tcp_link() -> str:
+    return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
 
 
 OVERVIEW = "overview.png"

@@ -152,13 +152,13 @@ def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage
         node.wait_until(
             "the recorder to be heard",
             lambda: (
-                node.value("confocal_driver", "axes_subscribers") >= 3
+                node.value(_axes_of(plan), "axes_subscribers") >= 3
                 and node.value("confocal_driver", "confocal_subscribers") >= 3
                 and node.value("corrector", "points_subscribers") >= 1 + plan.view
             ),
         )
     with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
-        _scan(node, plan.scan_samples, progress)
+        _scan(node, plan, progress)
     if plan.view:
         _until_seen()
     with stage("ending the nodes"):
@@ -175,6 +175,8 @@ def _until_seen() -> None:
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
     processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
     processes.start("confocal_driver", **plan.driver_parameters())
+    if (beside := plan.beside_parameters()) is not None:
+        processes.start(beside[0], **beside[1])
     processes.start(
         "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
     )
@@ -185,24 +187,36 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
         "the driver, calibrator and corrector to find each other",
         lambda: (
             node.value("confocal_driver", "connections") >= 1
-            and node.value("confocal_driver", "axes_subscribers") >= 2
+            and (beside is None or node.value(beside[0], "connections") >= 1)
+            and node.value(_axes_of(plan), "axes_subscribers") >= 2
             and node.value("confocal_driver", "confocal_subscribers") >= 2
         ),
     )
 
 
-def _scan(node: DemoNode, samples: int, progress: Callable[[int], None]) -> None:
+def _axes_of(plan: Demonstration) -> str:
+    """Return the node that publishes the axes."""
+    beside = plan.beside_parameters()
+    return "axis_driver" if beside and beside[0] == "axis_driver" else "confocal_driver"
+
+
+def _scan(node: DemoNode, plan: Demonstration, progress: Callable[[int], None]) -> None:
     """Scan, and wait until all of it is corrected and recorded."""
-    earlier = node.value("confocal_driver", "blocks")
+    samples = plan.scan_samples
+    drivers = {"/omsm/axes": _axes_of(plan), "/omsm/confocal": "confocal_driver"}
+    earlier = {topic: node.value(driver, "blocks") for topic, driver in drivers.items()}
     node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
     _follow(node, "corrector", ("axes_received", "distance_received"), samples, progress)
     node.wait_until(
         "the last clouds to be recorded",
         lambda: (
-            node.value("recorder", "/omsm/points") == node.value("corrector", "clouds_published")
-            and node.value("recorder", "/omsm/axes")
-            == node.value("recorder", "/omsm/confocal")
-            == node.value("confocal_driver", "blocks") - earlier
+            node.value("corrector", "pairs_held") == 0
+            and node.value("recorder", "/omsm/points")
+            == node.value("corrector", "clouds_published")
+            and all(
+                node.value("recorder", topic) == node.value(driver, "blocks") - earlier[topic]
+                for topic, driver in drivers.items()
+            )
         ),
     )
 
@@ -221,10 +235,10 @@ def _follow(
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="cell_demo", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
-    parser.add_argument("--time-lapse", type=float, default=20.0)
+    parser.add_argument("--time-lapse", type=float)
     parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--start-radius", type=float, default=12.7e-3, help="[m]")
+    parser.add_argument("--start-radius", type=float, help="[m]")
     parser.add_argument("--disturbances", type=Path, help="what is wrong with the machine")
     parser.add_argument("--view", action="store_true", help="show the scan in a browser")
     parser.add_argument("--json", action="store_true")

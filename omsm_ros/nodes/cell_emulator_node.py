@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ from std_srvs.srv import Trigger
 from omsm_ros import quantities
 from omsm_ros.emulators.acceleration import AccelerationFeed
 from omsm_ros.emulators.generic_stream import Faults
-from omsm_ros.emulators.players import EMULATED, emulated, line_for
+from omsm_ros.emulators.instrument import Line
+from omsm_ros.emulators.players import EMULATED, emulated, line_for, player_for
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
@@ -23,6 +26,7 @@ from omsm_ros.storage import conversions
 from omsm_ros.storage.claim import claimed
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.runtime_folder import runtime_folder
+from omsm_ros.twin.channels import ReferenceSensor
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
@@ -47,6 +51,7 @@ PARAMETERS = (
     Parameter(
         "link", "", "serial port to offer, or tcp://127.0.0.1:PORT; empty = in a private folder"
     ),
+    Parameter("link_beside", "", "of the second device, where the cell has one; as `link`"),
     Parameter("time_lapse", 1.0, "how much faster than real time to play", quantities.TIME_LAPSE),
     *_SCENARIO,
     Parameter("disturbances", "", "file of what is wrong with the machine"),
@@ -77,6 +82,9 @@ class CellEmulatorNode(ManagedNode):
         self._scenario = Scenario(**{p.name: values[p.name] for p in _SCENARIO})
         file = values["disturbances"]
         self._disturbances = load_disturbances(file) if file else NOTHING
+        beside = emulated(values["device"]).beside
+        if beside and beside.node == "reference_driver" and not self._disturbances.reference:
+            self._disturbances = replace(self._disturbances, reference=ReferenceSensor())
         faults = Faults(
             seed=values["seed"],
             **{p.name.removeprefix("fault_"): values[p.name] for p in _FAULTS},
@@ -85,7 +93,7 @@ class CellEmulatorNode(ManagedNode):
         if not self._link.startswith("tcp://"):
             undo.enter_context(claimed(Path(self._link)))
         line = undo.enter_context(line_for(self._link))
-        self._player = emulated(values["device"]).player(line, faults)
+        self._player = player_for(values["device"], line, self._beside(undo), faults)
         undo.callback(self._player.close)
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
@@ -94,6 +102,19 @@ class CellEmulatorNode(ManagedNode):
         self._felt = self.publish_on(undo, AccelerationBlock, "acceleration")
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
+
+    def _beside(self, undo: ExitStack) -> Line | None:
+        """Return the port of the second device, None where the cell has one device."""
+        device = self.values["device"]
+        if (beside := emulated(device).beside) is None:
+            return None
+        link = self.values["link_beside"]
+        if beside.tcp and not link:
+            raise ConfigurationError(f"device {device!r} needs a link_beside: tcp://127.0.0.1:PORT")
+        link = link or f"{self._link}_beside"
+        if not link.startswith("tcp://"):
+            undo.enter_context(claimed(Path(link)))
+        return undo.enter_context(line_for(link))
 
     def activate(self, undo: ExitStack) -> None:
         """Let motions be played."""

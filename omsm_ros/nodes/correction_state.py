@@ -8,6 +8,8 @@ from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.core.samples.throughput import LoadMeter
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 
+# Without a block for so long, and for as long as several last, the motion has paused [s].
+PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
 _STREAMS = ("axes", "distance")
 # Longer than the pauses within a step test; five samples of a slow device.
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
@@ -41,12 +43,18 @@ class CorrectionState:
         self._flows = {stream: Flow() for stream in _STREAMS}
         self._recent = RecentIncrease()
         self._oldest_ns = 0
+        self._resumes = 0.0
 
-    def heard(self, stream: str, first: int, samples: int, period: float) -> None:
-        """Note a block, whatever becomes of it; first: its trigger number."""
+    def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
+        """Note a block, whatever becomes of it; first: its trigger number;  now: [s]."""
+        self._resumes = now + max(PAUSE_S, _PAUSE_BLOCKS * samples * period)
         self.begins_at.setdefault(stream, first)
         self._heard[stream] += samples
         self._period[stream] = period
+
+    def pauses(self, now: float) -> bool:
+        """Return whether no block came for as long as none does only where the motion ended [s]."""
+        return now > self._resumes
 
     def arrived(self, stamp_ns: int) -> None:
         """Note that a message arrived at ``stamp_ns`` [ns], of those now taken."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import LoadCalibration, PredictError
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
@@ -24,7 +25,7 @@ from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.nodes.aside import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
-from omsm_ros.nodes.correction_state import CorrectionState, light_values
+from omsm_ros.nodes.correction_state import PAUSE_S, CorrectionState, light_values
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
 from omsm_ros.nodes.frames import tell_frames
 from omsm_ros.nodes.managed import ManagedNode
@@ -77,6 +78,9 @@ class CorrectorNode(ManagedNode):
     def activate(self, undo: ExitStack) -> None:
         """Begin to correct."""
         undo.callback(self._publish_rest)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.create_timer(PAUSE_S / 2, self._settle, clock=steady)
+        undo.callback(self.destroy_timer, timer)
         for stream, (topic, kind) in _STREAMS.items():
             self._waiting[stream] = []
             take, push = partial(self._take, stream), partial(self._push, stream)
@@ -171,7 +175,8 @@ class CorrectorNode(ManagedNode):
         samples = len(message.z if stream == "axes" else message.distance)
         if stream not in self._state.begins_at:
             self.get_logger().info(f"{stream}: begins at trigger {message.first_sample}")
-        self._state.heard(stream, message.first_sample, samples, message.sample_period)
+        period = message.sample_period
+        self._state.heard(stream, message.first_sample, samples, period, time.monotonic())
         self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
@@ -200,6 +205,12 @@ class CorrectorNode(ManagedNode):
             # One after the other: the middleware keeps room for its longest message many times.
             self._publish(self._corrector.take())
         self._state.done(time.time_ns())
+
+    def _settle(self) -> None:
+        """Publish what waits for stamps, where none come: the motion has ended."""
+        if self._corrector and self._corrector.held and self._state.pauses(time.monotonic()):
+            self._corrector.settle()
+            self._publish(self._corrector.take())
 
     def _refuse(self, stream: str, samples: int, err: OmsmError) -> None:
         self._state.refused[stream] += samples

@@ -29,12 +29,20 @@ def account(cell, stream):
     return counts
 
 
+OTHERS = ("chrocodile", "chrocodile_packet", "confocaldt", "confocaldt_ethernet", "capancdt")
+
+
 @pytest.mark.parametrize(
-    "device", ["six_channel", pytest.param("chrocodile", marks=pytest.mark.soak)]
+    "device",
+    ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)],
 )
 def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(
-        cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=1e-3, device=device
+        cell.folder / "demo",
+        seed=2,
+        time_lapse=3.0 if device == "confocaldt" else 20.0,
+        start_radius=1e-3,
+        device=device,
     )
     plan.prepare()
     perform(cell.operator, cell.processes, plan, Stage(quiet=True))

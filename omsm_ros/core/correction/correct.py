@@ -170,6 +170,10 @@ class Corrector:
         self._ready = []
         return points
 
+    def settle(self) -> None:
+        """Correct the pairs that wait for stamps to come, for both streams have paused."""
+        self._correct(self._pairing.end())
+
     def finish(self) -> SurfacePoints | None:
         """End both streams and take what is left; what comes later begins a new session."""
         if self._motion is not None:

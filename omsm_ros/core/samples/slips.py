@@ -40,8 +40,7 @@ _FIRST_S = 1.0
 _SPAN_S, _STRIDE_S = 0.8, 0.2
 # Stamps of either stream that a verdict needs; of long blocks they span more than a second.
 _LEAST_STAMPS = 8
-# One or two at the end cost the pairs that they are of, but show no slip.
-_SURE_STAMPS = 3
+_SURE_STAMPS = 3  # one or two at the end cost the pairs that they are of, but show no slip
 # Over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
 # Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
@@ -76,6 +75,8 @@ class CommonTrigger:
 
 # One driver's stamps of one trigger, rounded twice, differ by no more than this [ns].
 _SAME_NS = 2.0
+# Stamps that leap so far ahead are of a motion after a pause; half of what settles pairs live [ns].
+_PAUSE_NS = 0.5e9
 # Pairs wait no longer than this for the first verdict: blocks are too long for one [s].
 _MOST_WAIT_S = 10.0
 
@@ -121,6 +122,13 @@ class StampLine:
                 return True
         return False
 
+    def leaps(self, session: int, count: int, period_ns: float) -> bool:
+        """Return whether the block that begins at ``count``, if one does, comes after a pause."""
+        expected = self.stamp_of(session, count, period_ns)
+        if expected is None or not self._coming or self._coming[0][:2] != (session, count):
+            return False
+        return self._coming[0][2] - expected >= _PAUSE_NS
+
     def next_in(self, session: int, end: int) -> int:
         """Return where the next block begins, ``end`` if not before it."""
         if self._coming and self._coming[0][0] == session:
@@ -137,6 +145,7 @@ class StampLine:
 class SlipWatch:
     """Judges pairs of two streams by the stamps of their blocks.
 
+    sessions: of axes and distance, whose pairs are watched
     found: the last slip there was, healed or not; None if there was none
     """
 
@@ -147,7 +156,7 @@ class SlipWatch:
         self._restart((-1, -1), 0)
 
     def _restart(self, sessions: tuple[int, int], first: int) -> None:
-        self._sessions, self._start = sessions, first
+        self.sessions, self._start = sessions, first
         self._state = Slip()
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
         # Nothing was judged yet; whether one driver stamps both, once any stamp was seen.
@@ -171,11 +180,6 @@ class SlipWatch:
         window = self._window()
         return Slip() if window is None else Slip(seen_from=math.ceil(self._limit(window)))
 
-    @property
-    def sessions(self) -> tuple[int, int]:
-        """Of axes and distance, whose pairs are watched."""
-        return self._sessions
-
     def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
     ) -> Iterator[tuple[int, bool]]:
@@ -183,24 +187,23 @@ class SlipWatch:
 
         Yield up to which count all those that still wait are settled, and whether they slipped.
         """
-        if sessions != self._sessions:
+        if sessions != self.sessions:
             self._restart(sessions, first)
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
+            pairs = zip(self._lines, sessions, strict=True)
+            if self._common or any(line.leaps(s, count, period_ns) for line, s in pairs):
+                yield count, self.end()
             before = self._state.samples
-            if self._common:
-                yield count, bool(before)
             self._observe(count, period_ns)
             if before or self._state.samples:
                 yield count, True
                 self._shown = [count, count]
             else:
                 yield self._agreed(count, period_ns), False
-        stamped = all(
-            line.stamp_of(session, first, period_ns) is not None
-            for line, session in zip(self._lines, sessions, strict=True)
-        )
+        pairs = zip(self._lines, sessions, strict=True)
+        stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
         if self._common or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
 
@@ -211,7 +214,7 @@ class SlipWatch:
         if self._state.samples or self._odd_at <= since or few or not self._in_real_time():
             return bool(self._state.samples)
         rows = np.array([seen for seen in self._seen if seen[0] > since])
-        found = self._verdict(_skews(rows, self._period_ns))
+        found = self._verdict(rows[:, 1] / self._period_ns)
         if found.samples and len(rows) >= _SURE_STAMPS:
             self._state = self.found = found
         return bool(found.samples)
@@ -226,12 +229,12 @@ class SlipWatch:
         return self._judged_to if odd else max(min(self._shown), self._judged_to)
 
     def _next(self, end: int) -> int:
-        pairs = zip(self._lines, self._sessions, strict=True)
+        pairs = zip(self._lines, self.sessions, strict=True)
         return min(line.next_in(session, end) for line, session in pairs)
 
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew where a block of either stream begins."""
-        (axes, distance), (a, d) = self._lines, self._sessions
+        (axes, distance), (a, d) = self._lines, self.sessions
         begun = axes.advance(a, count), distance.advance(d, count)
         late, early = axes.stamp_of(a, count, period_ns), distance.stamp_of(d, count, period_ns)
         if late is None or early is None:
@@ -270,13 +273,12 @@ class SlipWatch:
         if not (self._odd or self._state.samples or self._starting):
             return
         rows = self._recent()
-        if rows is None:
+        if rows is None or not self._in_real_time():
             self._state, self._odd = Slip(), True
-        elif not self._in_real_time():
-            self._state, self._odd = Slip(), True
-            self._starting, self._judged_to = False, count  # stamps tell nothing
+            if rows is not None:
+                self._starting, self._judged_to = False, count  # stamps tell nothing
         else:
-            window = _skews(rows, self._period_ns)
+            window = rows[:, 1] / self._period_ns
             self._state = self._verdict(window)
             self._starting, self._judged_to = False, int(rows[0, 0])
             self._odd = bool(np.any(abs(window) >= self._steady(self._period_ns)))
@@ -302,7 +304,7 @@ class SlipWatch:
     def _window(self) -> FloatArray | None:
         """Return the skews to be judged [samples], None if they say nothing."""
         rows = self._recent()
-        return None if rows is None or not self._in_real_time() else _skews(rows, self._period_ns)
+        return None if rows is None or not self._in_real_time() else rows[:, 1] / self._period_ns
 
     def _steady(self, period_ns: float) -> float:
         """Return the skew of stamps without scatter that is a slip [samples]."""

@@ -58,6 +58,21 @@ def test_a_slip_just_before_the_end_is_kept_back_too(last: int) -> None:
     assert len(done.axes) == 12_000
 
 
+@pytest.mark.parametrize("missed", [0, 10])
+def test_a_pause_settles_what_came_before_it_as_the_end_does(missed: int) -> None:
+    """What is settled live in the silence is settled alike by the stamps, offline."""
+    before = LONG[:12_100]
+    after = Device(np.arange(20_000, 26_000), first=12_100, jitter=2e-5, seed=3).blocks()
+    axes = Device(before, jitter=2e-5, seed=1).blocks()
+    probe = Device(without(before, 12_010, missed), jitter=2e-5, seed=2).blocks()
+    ended = join(axes, probe)
+    resumed = join([*axes, *after], probe)
+    assert len(resumed.wrong) == len(ended.wrong) == 0
+    assert (
+        resumed.axes[: len(ended.axes)] == ended.axes == list(range(12_000 if missed else 12_100))
+    )
+
+
 @pytest.mark.parametrize("offset", [0, 4])
 def test_a_short_motion_is_judged_as_a_whole(offset: int) -> None:
     axes = Device(ALL[:900], jitter=2e-5, seed=1).blocks()
