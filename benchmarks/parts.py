@@ -15,7 +15,7 @@ from benchmarks.row import Row
 # The long ones first: the processors are then busy to the end.
 RESULTS = (
     *("other_plants", "identification", "disturbed", "honesty", "selfcal", "budget"),
-    *("spectra", "correction", "free_path"),
+    *("spectra", "comparison", "correction", "free_path"),
 )
 TIMES = ("speed", "form", "real_data", "offline", "live", "devices", "twin", "campaign", "viewer")
 PARTS = (*RESULTS, *TIMES)

@@ -26,6 +26,7 @@ def save_fields(path: Path | str, fields: ScanFields) -> None:
         fields=fields.fields.astype(np.float32),
         every=np.int64(fields.every),
         bounds=np.array(fields.bounds, dtype=np.str_),
+        aligned=np.array(fields.aligned, dtype=np.str_),
     )
     save_bytes(path, content.getvalue())
 
@@ -42,8 +43,13 @@ def load_fields(path: Path | str) -> ScanFields:
             names, fields, every = (content[name] for name in _NAMES)
             # Where nobody says which are upper bounds, each may be one.
             bounds = content["bounds"] if "bounds" in content else np.unique(names)
+            aligned = content.get("aligned", ())
         found = ScanFields(
-            tuple(map(str, names)), fields.astype(np.float64), int(every), tuple(map(str, bounds))
+            tuple(map(str, names)),
+            fields.astype(np.float64),
+            int(every),
+            tuple(map(str, bounds)),
+            tuple(map(str, aligned)),
         )
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
         raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err

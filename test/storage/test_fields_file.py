@@ -9,7 +9,7 @@ from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.errors import FileError
 from omsm_ros.storage.fields_file import load_fields, save_fields
 
-FIELDS = ScanFields(("tilt", "tilt"), np.arange(6.0).reshape(2, 3) * 1e-9, 32, ("tilt",))
+FIELDS = ScanFields(("tilt", "tilt"), np.arange(6.0).reshape(2, 3) * 1e-9, 32, ("tilt",), ("tilt",))
 
 
 def test_there_and_back(tmp_path):
@@ -17,7 +17,7 @@ def test_there_and_back(tmp_path):
     save_fields(path, FIELDS)
     found = load_fields(path)
     assert (found.names, found.every) == (FIELDS.names, 32)
-    assert found.bounds == ("tilt",)
+    assert (found.bounds, found.aligned) == (("tilt",), ("tilt",))
     assert np.allclose(found.fields, FIELDS.fields, rtol=1e-6, atol=0)
     none = ScanFields((), np.empty((0, 0)), 1)
     save_fields(path, none)

@@ -26,7 +26,7 @@ TERMS: tuple[Term, ...] = terms_up_to(6, 2)
 # Of the area (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST_SHARE = 0.995
 
-# Of pairs that agree: in all terms at once, and in the place that is farthest off.
+# Of pairs that agree: in all terms or figures at once, and in the place that is farthest off.
 _TOGETHER, _PERCENTILE = 0.95, 99.0
 # A share of 95 % of so many draws is known to 1.3 %, one of 99 % to 0.6 %.
 _DRAWS = 300
@@ -183,7 +183,7 @@ def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]
         # Noise widens a peak to valley: by as much as one more noise does, of each its own.
         own = (plain[name].a, plain[name].b)
         excess = [float(np.mean(run)) - value for run, value in zip(runs, own, strict=True)]
-        expanded = COVERAGE_FACTOR * spread
+        expanded = _factor(len(FIGURES)) * spread
         e_n = ((own[0] - excess[0]) - (own[1] - excess[1])) / expanded if expanded > 0 else None
         found[name] = Number(*own, expanded, e_n)
     return found
@@ -222,6 +222,11 @@ def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> Float
     return made * side.single / np.std(made)
 
 
+def _factor(together: int) -> float:
+    """Return the coverage factor with which 95 % hold of so many ``together`` (Šidák, 1967)."""
+    return float(ndtri((1 + _TOGETHER ** (1 / together)) / 2))
+
+
 def _terms(
     matched: Matched, fitted: FloatArray, averaged: FloatArray
 ) -> tuple[tuple[TermNumber, ...], float, tuple[float, float, float]]:
@@ -235,7 +240,7 @@ def _terms(
     covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
     spread = np.sqrt(np.diag(covariance))
     whitened = np.linalg.solve(covariance / np.outer(spread, spread), value / spread)
-    factor = float(ndtri((1 + _TOGETHER ** (1 / len(names))) / 2))
+    factor = _factor(len(names))
     terms = tuple(
         TermNumber(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
         for term, d, s in zip(names, value, spread, strict=True)

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.special import erf
 
+from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR
 from omsm_ros.core.correction.unknown_curves import components, random_walk
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -65,8 +67,10 @@ def likely_drift(
     noise: independent standard deviation of each place (m,) [m]
     drifts: shapes for a size of one metre (l, m)
 
-    It is the most likely size of ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ drifts)``,
-    and so holds whatever of the difference goes along with the time of the scans.
+    With ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ drifts)`` some sizes s are likelier
+    than others, a priori each alike in its logarithm; two of the size returned hold 95.45 % of
+    what those make together. A drift of which the difference shows little may be larger than
+    the likeliest: where one number alone told its size, the factor would be Student's.
     """
     some = np.linspace(0, len(difference) - 1, min(_NODES, len(difference))).astype(np.int64)
     shapes = known[:, some]
@@ -77,8 +81,9 @@ def likely_drift(
     values, vectors = np.linalg.eigh(walked.T @ walked)
     values = np.maximum(values, 0.0)
     square = (vectors.T @ (walked.T @ data)) ** 2
-    sizes = np.concatenate([[0.0], _DRIFTS_M])
-    likelihood = [
-        np.sum(square * s**2 / (1 + s**2 * values)) - np.sum(np.log1p(s**2 * values)) for s in sizes
-    ]
-    return float(sizes[int(np.argmax(likelihood))])
+    sizes = _DRIFTS_M[:, np.newaxis]
+    likelihood = np.sum(square * sizes**2 / (1 + sizes**2 * values), axis=1)
+    likelihood -= np.sum(np.log1p(sizes**2 * values), axis=1)
+    weight = np.exp(0.5 * (likelihood - likelihood.max()))
+    held = erf(COVERAGE_FACTOR / np.sqrt(2) * sizes / _DRIFTS_M) @ (weight / weight.sum())
+    return float(np.interp(erf(COVERAGE_FACTOR / np.sqrt(2)), held, _DRIFTS_M))

@@ -26,9 +26,6 @@ AT_ONCE, STATED, ESTIMATED, NOT_KNOWN = (
     "taken at once", "stated", "estimated from the difference", "not known",
 )  # fmt: skip
 
-# Errors of one number of the calibration, whose sign is the same in every scan.
-_OF_THE_CALIBRATION = ("lateral_lag", "static_gain")
-
 
 class Fields(Protocol):
     """What systematic errors do to points, as a scan's ``ScanFields`` has it."""
@@ -36,6 +33,11 @@ class Fields(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Name of the source of each field."""
+        ...
+
+    @property
+    def aligned(self) -> tuple[str, ...]:
+        """Names of those whose fields are the same errors in every scan of one calibration."""
         ...
 
     def at(self, first: int, count: int) -> FloatArray:
@@ -116,10 +118,13 @@ def _shared(halves: tuple[Half, Half], errors: tuple[Errors, Errors]) -> tuple[s
     ids = {half.measurement.calibration for half in halves}
     if len(ids) > 1 or not all(ids):
         return ()
+    one, other = (half.measurement.fields for half in halves)
+    if one is None or other is None:
+        return ()
     return tuple(
         name
-        for name in _OF_THE_CALIBRATION
-        if all(len(e.shapes.get(name, ())) == 1 for e in errors)
+        for name in one.aligned
+        if name in other.aligned and len(errors[0].shapes[name]) == len(errors[1].shapes[name])
     )
 
 

@@ -18,6 +18,8 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 # Of the variance of one source: half a hundredth of its standard uncertainty. Of that of all: a
 # figure may look where the largest ones do nothing, so a five-hundredth of a standard uncertainty.
 _LEFT_OUT_OF_ONE, _LEFT_OUT_OF_ALL = 1e-2, 4e-6
+# Sources of the calibration: in every scan that it corrects, each of their directions has one size.
+_OF_THE_CALIBRATION = ("dynamics", "could_hide", "lateral_lag", "static_gain")
 # With fewer points a turn what repeats twice in it would be cut off between them.
 _LEAST_POINTS_PER_TURN = 12
 
@@ -29,12 +31,15 @@ class ScanFields:
     names: of the source of each, (s,);  every: of how many points of the scan one is here
     fields: change of the heights [m] per standard uncertainty, (s, m)
     bounds: names of the sources of which only an upper bound is known
+    aligned: names of the sources whose fields are, in this order, those of the same errors in
+        every scan with the same calibration
     """
 
     names: tuple[str, ...]
     fields: FloatArray
     every: int
     bounds: tuple[str, ...] = ()
+    aligned: tuple[str, ...] = ()
 
     def at(self, first: int, count: int) -> FloatArray:
         """Return the fields (s, count) [m] at the scan's points from ``first`` on."""
@@ -59,16 +64,21 @@ def scan_fields(
     """
     names: list[str] = []
     rows: list[FloatArray] = []
+    aligned = tuple(name for name in _OF_THE_CALIBRATION if name in fields)
     for name, found in fields.items():
-        principal = _principal(found)
-        names += [name] * len(principal)
-        rows += list(principal)
+        own = found if name in aligned else _principal(found)
+        names += [name] * len(own)
+        rows += list(own)
     if not rows:
         return ScanFields((), np.empty((0, 0)), every)
-    kept = np.flatnonzero(_count(np.array(rows), _LEFT_OUT_OF_ALL))
+    counts = _count(np.array(rows), _LEFT_OUT_OF_ALL)
+    # To be found again in another scan, they stay together.
+    together = {name for name, own in zip(names, counts, strict=True) if own and name in aligned}
+    kept = np.flatnonzero(counts | np.isin(names, list(together)))
     left = tuple(names[k] for k in kept)
     known = tuple(name for name in bounds if name in left)
-    return ScanFields(left, np.array([rows[k] for k in kept]), every, known)
+    same = tuple(name for name in aligned if name in together)
+    return ScanFields(left, np.array([rows[k] for k in kept]), every, known, same)
 
 
 def resolves_turns(points: ScanPoints) -> bool:

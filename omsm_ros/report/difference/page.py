@@ -116,7 +116,9 @@ def _numbers(facts: Mapping[str, Any]) -> Table:
         )
         for name, n in facts["e_n"].items()
     ]
-    return Table("Figures of both, k = 2", ("A", "B", "U of the difference", "E_n"), rows)
+    return Table(
+        "Figures of both; U: 95 % for all together", ("A", "B", "U of the difference", "E_n"), rows
+    )
 
 
 def _terms(facts: Mapping[str, Any]) -> Table:

@@ -133,7 +133,33 @@ def turned_field(scan_of, size):
     step = 1e-6
     x, y = points.x[::5], points.y[::5]
     field = (form(x - step * y, y + step * x) - form(x, y)) / step
-    return ScanFields(("lateral_lag",), size * field[np.newaxis], 5)
+    return ScanFields(("lateral_lag",), size * field[np.newaxis], 5, (), ("lateral_lag",))
+
+
+def test_each_direction_of_a_calibration_is_one_error_in_both():
+    first, second = scan(1, drift=0.0), scan(2, feed=2e-4, rpm=45, drift=0.0)
+
+    def known(m, *turns):
+        rows = np.concatenate([turned_field(m, size).fields for size in turns])
+        names = ("could_hide",) * len(turns)
+        return ScanFields(names, rows, 5, (), ("could_hide",))
+
+    def explained(*of_both):
+        sides = [
+            Measurement(name=m.name, points=m.points, fields=f, drift=0.0, calibration="one")
+            for m, f in zip((first, second), of_both, strict=True)
+        ]
+        found = compare(*sides)
+        return next(t.uncertainty for t in found.agreement.terms if (t.n, t.m) == (2, 2))
+
+    wide = explained(known(first, 2e-3, 3e-3), known(second, 2e-3))
+    cancelled = explained(known(first, 2e-3, 3e-3), known(second, 2e-3, 3e-3))
+    turned = explained(known(first, 2e-3, 3e-3), known(second, -2e-3, -3e-3))
+    assert cancelled < 0.1 * wide
+    # What is of opposite signs in both adds up; of independent errors only the squares would.
+    assert turned == pytest.approx(
+        wide * 2 * np.hypot(2, 3) / np.sqrt(2**2 + 3**2 + 2**2), rel=0.05
+    )
 
 
 def test_an_error_that_both_share_is_subtracted():

@@ -55,6 +55,21 @@ def test_between_the_points_the_fields_are_those_of_the_points_there() -> None:
     assert np.array_equal(few.at(6000, 5)[:, 0], few.at(6000, 5)[:, 4])
 
 
+def test_directions_of_the_calibration_stay_what_they_are() -> None:
+    """In another scan with it they are the same errors; principal ones would be mixtures."""
+    rng = np.random.default_rng(3)
+    of_one, of_other = (rng.normal(size=(3, 200)) * [[1e-9], [3e-9], [1e-14]] for _ in range(2))
+    slow, fast = (
+        scan_fields({"tilt": rows[:2], "could_hide": rows}, 7) for rows in (of_one, of_other)
+    )
+    for found, rows in ((slow, of_one), (fast, of_other)):
+        assert found.aligned == ("could_hide",)
+        own = found.fields[[name == "could_hide" for name in found.names]]
+        np.testing.assert_array_equal(own, rows)
+        assert found.names.count("tilt") == 2
+        assert not any(np.allclose(row, rows[0], atol=0) for row in found.fields[:2])
+
+
 def test_without_sources_there_are_no_fields() -> None:
     assert scan_fields({}, 4).at(0, 7).shape == (0, 7)
 

@@ -91,7 +91,9 @@ def test_what_is_not_evaluated_is_not_a_number():
     _, facts, _ = page(common=None)
     assert [h.value for h in headlines(facts)][1] == "not evaluated"
     tables = {table.title: table.rows for table in records(facts)}
-    assert all(row[-1] == "not evaluated" for row in tables["Figures of both, k = 2"])
+    assert all(
+        row[-1] == "not evaluated" for row in tables["Figures of both; U: 95 % for all together"]
+    )
     assert not tables["Zernike terms of A − B, one at the rim"]
 
 
