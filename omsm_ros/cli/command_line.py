@@ -169,8 +169,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as err:
         if os.environ.get(DEBUG):
             raise
-        _say(defect(err))
-        return DEFECT
+        return _unforeseen(err)
+
+
+def _unforeseen(err: Exception) -> int:
+    """Say what nobody foresaw; return the exit status."""
+    if isinstance(err, OSError) and err.filename is not None:
+        # Of a place that the system refuses: a name too long, no permission, a broken disk.
+        path = quantities.shown(os.fsdecode(err.filename))
+        _say(f"{path}: {err.strerror}; check the path and its permissions")
+        return BAD_INPUT
+    _say(defect(err))
+    return DEFECT
 
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:

@@ -176,9 +176,9 @@ def _show_correct(summary: Facts) -> None:
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
         text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         rows.append((stream, text))
-    light = summary["light"]
-    rows.append((light["level"], light["word"]))
-    rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
+    if light := summary.get("light"):  # without one corrected sample there is none
+        rows.append((light["level"], light["word"]))
+        rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
     rows += [("warning", text) for text in summary.get("warnings", [])]
     if "form" in summary:
         rows += form_rows(summary["form"])

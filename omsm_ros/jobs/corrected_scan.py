@@ -179,10 +179,10 @@ class CorrectedScan:
                 f"stream was recorded more than {MOST_WAITING} samples ahead of the other; "
                 "record both at the same time"
             )
-        if not account.distance.received:
-            raise BagError(
-                f"{str(self.path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan"
-            )
+        received = (account.axes.received, account.distance.received)
+        for topic, samples in zip(TOPICS, received, strict=True):
+            if not samples:
+                raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
 
 def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock | DistanceBlock]:

@@ -40,7 +40,7 @@ def load_fields(path: Path | str) -> ScanFields:
         raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
     try:
         with np.load(io.BytesIO(raw)) as content:  # no pickles, by default
-            names, fields, every = (content[name] for name in _NAMES)
+            names, fields, every = (np.asarray(content[name]) for name in _NAMES)
             # Where nobody says which are upper bounds, each may be one.
             bounds = content["bounds"] if "bounds" in content else np.unique(names)
             aligned = content.get("aligned", ())

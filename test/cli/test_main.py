@@ -3,6 +3,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from omsm_ros import cli
@@ -69,6 +70,21 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {
         *("cloud.ply", "summary.json", "report.html", "systematic.npz"),
     }
+
+
+def test_a_scan_of_which_nothing_can_be_corrected_is_told(
+    capsys, folder, tmp_path, small_scan_blocks
+):
+    with BagWriter(tmp_path / "dark.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in small_scan_blocks[:20]:
+            bag.write_axes(axes)
+            dark = np.full(len(distance.distance), np.nan)
+            bag.write_distance(dataclasses.replace(distance, distance=dark))
+    arguments = ("correct", tmp_path / "dark.mcap", "--calibration", folder / "cal.json")
+    status, text, err = run(capsys, *arguments, "--out", tmp_path / "out")
+    assert (status, err) == (0, "")
+    assert "not one of 2000 readings is valid" in text
+    assert "not one sample could be corrected" in text
 
 
 def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):

@@ -215,7 +215,10 @@ def test_a_spindle_that_stands_makes_no_scan(place, speed):
 
 
 @pytest.mark.timeout(20)
-@pytest.mark.parametrize("path", ["pipe", "folder", "/dev/zero", "loop", "none", "latin"])
+@pytest.mark.parametrize(
+    "path",
+    ["pipe", "folder", "/dev/zero", "loop", "none", "latin", pytest.param("n" * 300, id="long")],
+)
 @pytest.mark.parametrize(
     "words",
     [

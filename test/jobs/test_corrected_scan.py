@@ -138,12 +138,15 @@ def test_overridden_it_says_so_in_the_cloud(bag, true_calibration, tmp_path):
     assert b"OVERRIDDEN" in (tmp_path / "cloud.ply").read_bytes()[:512]
 
 
-@pytest.mark.parametrize("topics", [(), (bags.AXES_TOPIC,)], ids=["nothing", "no probe"])
-def test_a_bag_without_samples_is_refused(tmp_path, small_scan_blocks, true_calibration, topics):
+@pytest.mark.parametrize("held", ["nothing", "axes", "distance"])
+def test_a_bag_without_samples_is_refused(tmp_path, small_scan_blocks, true_calibration, held):
     path = tmp_path / "empty.mcap"
+    axes, distance = small_scan_blocks[0]
     with BagWriter(path, TOPICS) as writer:
-        if topics:
-            writer.write_axes(small_scan_blocks[0][0])
+        if held == "axes":
+            writer.write_axes(axes)
+        if held == "distance":
+            writer.write_distance(distance)
     with pytest.raises(BagError, match="no samples on"):
         correct_bag(path, true_calibration, tmp_path / "cloud.ply")
 

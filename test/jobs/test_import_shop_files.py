@@ -169,7 +169,7 @@ def test_a_trigger_that_does_not_count_is_named_with_its_file(read, rows, said):
         ("Logger 7\nno. 12\ni,d\n0,1\n", "", "lines_before_names: 2"),
         ("i,d\n,um\n0,1\n", "", "lines_after_names: 1"),
         ("i,d\n0,1\nmean,1\n", "", "line 3"),
-        ("i,d\n0,1\n1,2\n2", "", "was it cut"),
+        ("i,d\n0,1\n1,2\n2", "", "check whether it was cut"),
         ("i,d\n0,---\n", "", "invalid: ['---']"),
         ("0,1\n1,2\n", "", "by place"),
         ("i,d\n0,=A1*2\n", "", "line 2"),

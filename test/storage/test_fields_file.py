@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,19 @@ def test_where_nobody_says_which_are_upper_bounds_each_may_be_one(tmp_path):
     path = tmp_path / "systematic.npz"
     np.savez(path, names=np.array(["tilt", "tilt", "pitch"]), fields=np.zeros((3, 4)), every=1)
     assert load_fields(path).bounds == ("pitch", "tilt")
+
+
+def test_a_member_that_is_no_array_is_refused(tmp_path):
+    path = tmp_path / "systematic.npz"
+    save_fields(path, FIELDS)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["fields.npy"] = b"no array" + members["fields.npy"][8:]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, raw in members.items():
+            archive.writestr(name, raw)
+    with pytest.raises(FileError, match="damaged"):
+        load_fields(path)
 
 
 @pytest.mark.parametrize(

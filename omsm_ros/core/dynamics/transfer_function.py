@@ -36,7 +36,8 @@ class TransferFunction:
     """G(s) with ascending ``numerator`` (m+1,), ``denominator`` (n+1,), m ≤ n, and ``delay`` [s].
 
     ``denominator[0]`` is 1 exactly; use :meth:`from_ascending` to have it scaled.
-    Raises DataError for coefficients that are not finite, or an improper ratio.
+    Raises DataError for coefficients that are not finite, a denominator that is longer than its
+    degree, or an improper ratio.
     """
 
     numerator: FloatArray
@@ -52,6 +53,8 @@ class TransferFunction:
             object.__setattr__(self, name, values)
         if self.denominator[0] != 1.0:
             raise DataError(f"denominator[0] is {self.denominator[0]!r}, expected 1")
+        if self.denominator[-1] == 0:
+            raise DataError("the last coefficient of the denominator is 0; leave it out")
         if len(self.numerator) > len(self.denominator):
             raise DataError(
                 f"improper: numerator of degree {len(self.numerator) - 1}, "

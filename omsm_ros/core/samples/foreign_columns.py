@@ -138,7 +138,7 @@ class ColumnMap:
         lacking = [a for a in AXES if a not in self.columns]
         if "z" in self.columns and lacking:
             raise DataError(
-                f"axis {lacking[0]!r} has no column; where it stood still, say so: "
+                f"axis {lacking[0]!r} has no column; where it stood still, state it, as "
                 f"{lacking[0]}: {{constant: 0.0}}"
             )
 

@@ -69,7 +69,9 @@ class StreamWatch:
         return self._marks[0][0][1] if self.samples else 0
 
     def faults(self, name: str) -> Iterator[str]:
-        """Yield what is wrong, in words for people."""
+        """Yield what is wrong, in words for people; nothing is with what never came."""
+        if not self.samples:
+            return
         if self.missing:
             places = ", ".join(f"{first} to {last}" for first, last in self.gaps)
             more = f" and {self.places - len(self.gaps)} more" * (self.places > len(self.gaps))

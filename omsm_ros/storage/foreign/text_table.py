@@ -189,9 +189,10 @@ class TextTable(ForeignTable):
         if self._form.decimal == "." and ";" in line and "," in line:
             return "for decimal commas, write decimal: ',' and delimiter: ';' into the map"
         if len(cells) != len(self.names):
-            of_commas = ", or is its comma a decimal one?" if self._form.delimiter == "," else ""
+            of_commas = ", or its comma is a decimal one" if self._form.delimiter == "," else ""
             return (
-                f"it has {len(cells)} cells under {len(self.names)} names; was it cut?{of_commas}"
+                f"it has {len(cells)} cells under {len(self.names)} names; "
+                f"check whether it was cut{of_commas}"
             )
         try:
             rows.read_dates([line])

@@ -58,7 +58,7 @@ def _points(head: bytes, phase: FloatArray, what: str) -> MeasuredPoints:
     steps = _STEPS.get(_at(">h", head, 218))
     factors = [_at(">f", head, place) for place in (164, 168, 176)]
     if steps is None or not np.all(np.isfinite(factors)) or min(map(abs, factors)) <= 0:
-        raise FileError(f"{what} does not say how high a fringe is; export it with its scale")
+        raise FileError(f"{what} does not say how high a fringe is; export it again with its scale")
     scale = float(np.prod(factors)) / steps
     notes: tuple[str, ...] = ()
     if _at(">h", head, 232):

@@ -82,6 +82,7 @@ def test_a_root_at_zero_is_found():
         ([1.0], [[1.0]], 0.0, "denominator"),
         ([1.0], [2.0, 1.0], 0.0, r"denominator\[0\]"),
         ([1.0, 1.0], [1.0], 0.0, "improper"),
+        ([1.0], [1.0, 1e-3, 0.0], 0.0, "last coefficient"),
         ([1.0], [1.0], -1e-3, "delay"),
         ([1.0], [1.0], np.inf, "delay"),
         ([], [1.0], 0.0, "numerator"),
