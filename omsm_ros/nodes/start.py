@@ -44,6 +44,7 @@ def main() -> None:
     with nothing_to_undo(ENDING):
         end_with_launch()
         share_one_pool()
+        send_aside()
         for package, remedy in _NEEDED.items():
             try:
                 importlib.import_module(package)
@@ -75,6 +76,15 @@ def share_one_pool() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc has it
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
+
+
+def send_aside() -> None:
+    """Let Fast DDS send from a thread of its own: a listener that stands still stops nobody.
+
+    Whoever publishes would wait for it, a second and more; after 0.1 s Fast DDS forgets to send the
+    message at all, and what follows it reaches that listener only when the queue has run over.
+    """
+    os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "ASYNCHRONOUS")
 
 
 if __name__ == "__main__":

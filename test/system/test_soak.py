@@ -3,6 +3,7 @@
 import itertools
 import os
 import signal
+import struct
 import time
 from pathlib import Path
 
@@ -31,6 +32,7 @@ DEVICE_PORT = 17_000 + os.getpid() % 1000
 NODES = ("confocal_driver", "corrector", "calibrator", "recorder")
 MOST_GROWTH = 0.01
 LONGEST_FAULT_S = 3.0
+LONGEST_DELAY_S = 20.0  # of a listener that was stopped, and is sent again what it missed
 READING_PERIOD_S = 5.0
 
 
@@ -184,6 +186,9 @@ def test_an_hour_with_a_fault_every_minute(cell, true_calibration, step_test):
         the_account_is_closed(cell)
         cell.processes.end("recorder")
         assert sum(map(recorded_samples, hour.bags)) > 0.9 * SAMPLES
+        delays = [longest_delay_s(bag) for bag in hour.bags]
+        print(f"clouds reached the recorders after at most {delays} s")
+        assert max(delays) < LONGEST_DELAY_S
         assert max(growth.values()) < MOST_GROWTH, growth
 
 
@@ -233,3 +238,13 @@ def recorded_samples(path):
     """Samples of axes in a bag; one of a recorder that was killed has no index."""
     with bags.BagReader(path) as reader:
         return sum(len(block) for _, block in reader.records(bags.AXES_TOPIC))
+
+
+def longest_delay_s(path):
+    """How long a cloud was on its way to the recorder, at most: it is older than its stamp."""
+    delays = [0.0]
+    with bags.BagReader(path) as reader:
+        for _, recorded_ns, cdr in reader.messages([bags.POINTS_TOPIC], None, None):
+            sec, nanosec = struct.unpack_from("<iI", cdr, 4)
+            delays.append(1e-9 * (recorded_ns - nanosec) - sec)
+    return max(delays)
