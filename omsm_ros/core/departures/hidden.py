@@ -39,6 +39,8 @@ _UNSEEN = _DECADES / 3**0.5
 # A joint or a piezo goes on creeping for minutes, whatever a record lasts. Of what is slower than
 # ten records not even its beginning shows.
 _SLOWEST_CREEP_S, _MOST_RECORDS = 100.0, 10.0
+# Probability by chance below which a mode is carried that is not significant.
+_HINT = 0.05
 # Of the background: the drift that every fit has.
 _STEADY_DRIFT = slice(1, 2)
 
@@ -97,7 +99,7 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
         judged = survey.best.get(name)
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
-        if _excited(survey, judged):
+        if _excited(survey, judged) or _hinted(judged):
             found.append(_hidden(survey, judged))
     return found
 
@@ -196,13 +198,19 @@ def _excited(survey: Survey, judged: Judged) -> bool:
     return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
 
 
+def _hinted(judged: Judged) -> bool:
+    """Return whether chance alone makes such a mode in one test of twenty, or in fewer."""
+    return judged.term.family == MODE and judged.log_p < np.log(_HINT)
+
+
 def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
     fitted, term, score = survey.fitted, judged.term, judged.score
     shift = omitted(survey, term.columns[:, 0])
     frequency, rms = np.array(PAPER_SCAN).T
     imitated = _relative(fitted, frequency, shift)
     remaining = imitated - _departure(term.family, term.parameter, term.damping, frequency)
-    creeps = term.family == CREEP
+    # A light mode is tenfold at its own frequency, which no fitted coefficient imitates.
+    whole = term.family == CREEP or _hinted(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = float(np.linalg.norm(remaining.imag * rms)) / _SCAN_RATE
     return HiddenTerm(
@@ -211,11 +219,11 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
         float(score.size[0]),
         score.uncertainty,
         _missed(judged),
-        np.zeros_like(shift) if creeps else shift,
+        np.zeros_like(shift) if whole else shift,
         gain,
         np.eye(len(gain))[-1],
-        float(np.max(np.abs(remaining.real))) if creeps else 0.0,
-        lag if creeps else 0.0,
+        float(np.max(np.abs(remaining if term.family == MODE else remaining.real))) * whole,
+        lag * whole,
         float(np.sqrt(np.sum((np.abs(remaining) * rms) ** 2))),
     )
 

@@ -47,8 +47,12 @@ _LEAST_DECAYS = 1.0
 _FORGOTTEN_DECAYS = 7.0
 # A structure and its roll-off; what is not linear looks like many more.
 _PLAIN_POLES = 2
-# Two time constants a decade apart look much the same: the fit starts at several.
+# Two time constants a decade apart look much the same: the fit starts at several. Of modes those
+# looked for lie six per cent apart.
 _FASTER = (1.0, 2.0, 5.0)
+_BESIDE_MODE = (1.0, 0.97, 1.03)
+# As a logarithm; a mode that rings seven times is as wide.
+_SAME_LINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +96,11 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
         prepared, model = choose(prepared)
     grown: list[Term] = []
     settled: set[str] = set()
+    modes: list[float] = []
     refused: set[str] = set() if may_grow else {CREEP, MODE}
     survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
-        shown = survey.significant(refused | settled)
+        shown = _but_lines(survey.significant(refused | settled), modes)
         if not shown:
             break
         columns = _beside(survey, shown)
@@ -111,6 +116,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
             grown = []
         else:
             larger = _grown(prepared, model, shown[0].term)
+            modes += [shown[0].term.parameter] if shown[0].term.family == MODE else []
             if larger is None:
                 refused.add(shown[0].term.family)
                 continue
@@ -148,6 +154,20 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
         beside.samples
     )
     return columns if information(beside) + price < information(chosen.fit) else []
+
+
+def _but_lines(shown: Sequence[Judged], modes: Sequence[float]) -> list[Judged]:
+    """Return ``shown`` without lines of vibration at ``modes`` [Hz] that described more.
+
+    A light mode that the steps keep ringing looks like a line, and one that a fit has not met, or
+    met badly, leaves one. Beside the response it would be gone from it.
+    """
+    return [
+        judged
+        for judged in shown
+        if judged.term.family != VIBRATION
+        or all(abs(np.log(judged.term.parameter / mode)) > _SAME_LINE for mode in modes)
+    ]
 
 
 def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
@@ -206,12 +226,16 @@ def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Mode
     if term.family == CREEP or decays < _FORGOTTEN_DECAYS:
         # What has not died away at the end has not when a period begins anew.
         problem = replace(problem, fits_initial_condition=True)
-    starts = _FASTER if term.family == CREEP else (1.0,)
+    starts = _FASTER if term.family == CREEP else _BESIDE_MODE
     tried = [_with_poles(problem, base, new, starts) for base in _bases(model)]
     # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
     found = [c for c in tried if c is not None and _decays(c.fit, problem)]
     best = min(found, key=lambda candidate: candidate.bic, default=None)
-    if best is None or best.bic >= information(model.chosen.fit):
+    chosen = model.chosen.fit
+    if problem is not prepared.problem:
+        # What rang before the record is priced on both sides.
+        chosen = fit(problem, chosen.structure, [chosen.nonlinear])
+    if best is None or best.bic >= information(chosen):
         return None
     grown = replace(model, chosen=best, candidates=[*model.candidates, best])
     return replace(prepared, problem=problem), grown
