@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 
@@ -30,7 +31,6 @@ FORMATS = {"binary": "BIN", "ascii": "ASC"}
 _TIME_RANGE = 2**32
 # Start bit, eight data bits, stop bit.
 _BITS_PER_BYTE = 10
-_READ_S = 0.05
 
 
 class ChrocodileDevice(Chrocodile):
@@ -105,8 +105,9 @@ class ChrocodileDevice(Chrocodile):
         self._stream.expect(wire)
         self._transport.write(wire)
         deadline = self._monotonic() + (patience or self._wanted.patience)
+        unanswered = partial(self._unanswered, wire.decode("latin-1").strip())
         while True:
-            data = self._transport.read(_READ_S)
+            data = self._read_answer(self._stream.last_outside, unanswered)
             self._early += self._stream.feed(data)
             if not data:
                 self._stream.settle_answer()
@@ -114,7 +115,7 @@ class ChrocodileDevice(Chrocodile):
             if answer is not None:
                 return answer
             if self._monotonic() > deadline:
-                raise self._unanswered(wire.decode("latin-1").strip(), self._stream.last_outside)
+                raise unanswered(self._stream.last_outside)
 
     def _decode(self, data: bytes) -> Samples:
         early, self._early = self._early, []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from omsm_ros.protocols.chrocodile_packet import (
 )
 from omsm_ros.protocols.chrocodile_packet_decoder import PacketDecoder
 
-_READ_S = 0.05
 _TICKETS = 2**16
 
 
@@ -94,6 +94,8 @@ class ChrocodilePacketDevice(Chrocodile):
             for value in answer.values
             if not isinstance(value, bytes)
         )
+        if query and answer.flags & QUERY and not answer.values:
+            raise self._unanswered(name, answer.name.encode())  # our own words come back
         if answer.flags & ERROR:
             raise RefusedError(
                 f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose what it has"
@@ -103,7 +105,7 @@ class ChrocodilePacketDevice(Chrocodile):
     def _await(self, what: str, wanted: Callable[[Command], bool], patience: float) -> Command:
         deadline = self._monotonic() + patience
         while True:
-            data = self._transport.read(_READ_S)
+            data = self._read_answer(self._said, partial(self._unanswered, what))
             self._said = (self._said + data)[-64:]
             self._early += self._receive(data)
             commands, self._commands = self._commands, []

@@ -15,11 +15,12 @@ import numpy as np
 from omsm_ros.devices.blocks import BlockCutter, BlockPair, BlockSettings, Channels
 from omsm_ros.devices.counting import SAMPLE, Counting, Samples, SequenceTracker
 from omsm_ros.devices.transport import Transport
-from omsm_ros.errors import NoSamplesError
+from omsm_ros.errors import DeviceError, NoSamplesError
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Bytes without a sample for so long are another device's, or come at another baud rate.
 UNREADABLE_S = 2.0
+_ANSWER_S = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,13 +85,14 @@ class StreamDevice:
         self._came_ns, self._came_at = 0, self._heard  # when the last bytes did
         self._down = False
         self._renewals = 0
+        self._counted = self._heard  # when a counter last went on
 
     def open(self) -> None:
         """Connect, or connect again, and set the device up; raises DeviceError."""
         self._transport.open()
         self._down = True
         self._prepare()
-        self._opened = self._monotonic()
+        self._opened = self._counted = self._monotonic()
 
     def poll(self, timeout: float) -> list[BlockPair]:
         """Return the blocks completed by what arrives within ``timeout`` [s]; may be none.
@@ -106,7 +108,9 @@ class StreamDevice:
         silent = now - self._heard
         if len(samples):
             self._heard = now
-            return self._add(samples, arrival_ns, silent)
+            blocks = self._add(samples, arrival_ns, silent)
+            self._check_counter(now, int(samples["counter"][-1]))
+            return blocks
         if silent <= self._settings.pause:
             return []
         blocks = self._end(arrival_ns)
@@ -204,11 +208,31 @@ class StreamDevice:
                 "of this device; check the baud rate and what is connected"
             )
 
+    def _read_answer(self, said: bytes, unanswered: Callable[[bytes], DeviceError]) -> bytes:
+        """Return what comes; where another service hangs up, raise what tells what it ``said``."""
+        try:
+            return self._transport.read(_ANSWER_S)
+        except DeviceError as err:
+            if b"HTTP" in said or b"SSH" in said:
+                raise unanswered(said) from err
+            raise
+
+    def _check_counter(self, now: float, counter: int) -> None:
+        """Raise NoSamplesError if samples keep coming, but only such as came before."""
+        if now - self._counted > UNREADABLE_S:
+            raise NoSamplesError(
+                f"{self._transport.name} repeats its sample counter, {counter!r} last, so every "
+                "sample counts as a duplicate; check that the driver's settings name the counter "
+                "in its place, and that it counts"
+            )
+
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
         self._decoded += len(samples)
         after_silence = self._down or silent > self._settings.pause
         self._down = False
         runs = list(self._tracker.split(samples, silent, broken=after_silence))
+        if runs:
+            self._counted = self._monotonic()
         waited = self._ahead() * self._settings.sample_period
         came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
         return list(self._cutter.add(runs, came_ns, after_silence=after_silence))
