@@ -31,9 +31,13 @@ def test_every_device_is_made_from_the_defaults(name: str) -> None:
 
 
 def test_every_emulated_device_has_its_driver() -> None:
-    # A probe without encoders is no whole cell.
-    assert set(EMULATED) == set(DEVICES) - {"confocaldt"}
+    # The reference is beside a probe of the table.
+    assert set(EMULATED) == {*DEVICES, "capancdt"}
     names = {parameter.name for parameter in PARAMETERS}
+    # A probe without encoders is no whole cell.
+    beside = EMULATED["confocaldt"].beside
+    assert beside is not None
+    assert beside.node == "axis_driver"
     for each in EMULATED.values():
         assert set(each.driver) <= names
 
