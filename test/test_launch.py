@@ -149,5 +149,5 @@ def test_a_folder_without_the_yaml_is_an_error(launch, tmp_path):
 
 
 def test_what_has_no_emulator_is_named(launch):
-    with pytest.raises(ValueError, match="'confocaldt' has no emulator"):
-        launch(emulated="true", device="confocaldt")
+    with pytest.raises(ValueError, match="'analog' has no emulator"):
+        launch(emulated="true", device="analog")

@@ -85,14 +85,14 @@ class StreamDevice:
         self._came_ns, self._came_at = 0, self._heard  # when the last bytes did
         self._down = False
         self._renewals = 0
-        self._counted = self._heard  # when a counter last went on
+        self._went_on = self._heard  # when a counter last went on
 
     def open(self) -> None:
         """Connect, or connect again, and set the device up; raises DeviceError."""
         self._transport.open()
         self._down = True
         self._prepare()
-        self._opened = self._counted = self._monotonic()
+        self._opened = self._went_on = self._monotonic()
 
     def poll(self, timeout: float) -> list[BlockPair]:
         """Return the blocks completed by what arrives within ``timeout`` [s]; may be none.
@@ -219,7 +219,7 @@ class StreamDevice:
 
     def _check_counter(self, now: float, counter: int) -> None:
         """Raise NoSamplesError if samples keep coming, but only such as came before."""
-        if now - self._counted > UNREADABLE_S:
+        if now - self._went_on > UNREADABLE_S:
             raise NoSamplesError(
                 f"{self._transport.name} repeats its sample counter, {counter!r} last, so every "
                 "sample counts as a duplicate; check that the driver's settings name the counter "
@@ -232,7 +232,7 @@ class StreamDevice:
         self._down = False
         runs = list(self._tracker.split(samples, silent, broken=after_silence))
         if runs:
-            self._counted = self._monotonic()
+            self._went_on = self._monotonic()
         waited = self._ahead() * self._settings.sample_period
         came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
         return list(self._cutter.add(runs, came_ns, after_silence=after_silence))

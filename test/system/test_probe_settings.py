@@ -52,7 +52,8 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
     settings = json.loads(answer.calibration.settings)
     assert settings["probe.device"] == "chrocodile"
     assert settings["probe.averaging"] == 4
-    assert settings["probe.rate"] == pytest.approx(1050, rel=1e-3)  # just above the trigger
+    # Exposures just above four times the trigger, as four are averaged for each.
+    assert settings["probe.rate"] == pytest.approx(4 * 1050, rel=1e-3)
     cell.wait("it", lambda: node.text("corrector", "calibration") == answer.calibration.id)
 
     foreign = scanned("foreign.mcap", 8)
@@ -70,7 +71,7 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
 
     belonging = scanned("belonging.mcap", 4)
     cell.wait("its return", lambda: said not in node.text("corrector", "message"))
-    _scan(node, plan.scan_samples, int)
+    _scan(node, plan, int)
     assert node.value("corrector", "clouds_published") > 0
     processes.end("recorder")
     with CorrectedScan(belonging, calibration, CorrectionOptions()) as scan:
