@@ -76,10 +76,10 @@ class TcpServer:
     def read(self) -> bytes:
         """Return what the client sent; b"" if nothing."""
         self._accept()
-        if self._client is None:
+        if (client := self._client) is None:
             return b""
         try:
-            data = self._client.recv(_CHUNK_BYTES)
+            data = client.recv(_CHUNK_BYTES)
         except BlockingIOError:
             return b""
         except OSError:
@@ -92,13 +92,13 @@ class TcpServer:
         """Return bytes of ``data`` a client can get: fewer without one, or when ``stop`` is set."""
         self._accept()
         remaining = memoryview(data)
-        while remaining and self._client is not None and not (stop and stop.is_set()):
+        while remaining and (client := self._client) is not None and not (stop and stop.is_set()):
             try:
-                select.select([], [self._client], [], _LOOK_S)
-                remaining = remaining[self._client.send(remaining) :]
+                select.select([], [client], [], _LOOK_S)
+                remaining = remaining[client.send(remaining) :]
             except BlockingIOError:
                 continue
-            except OSError:
+            except (OSError, ValueError):  # a ValueError if it was unplugged at this moment
                 self._drop()
         return len(data) - len(remaining)
 
@@ -120,18 +120,19 @@ class TcpServer:
 
     def _gone(self) -> bool:
         """Return whether the client has closed its end."""
-        if self._client is None:
+        if (client := self._client) is None:
             return True
         try:
-            return self._client.recv(1, socket.MSG_PEEK) == b""
+            return client.recv(1, socket.MSG_PEEK) == b""
         except BlockingIOError:
             return False
         except OSError:
             return True
 
     def _drop(self) -> None:
-        if self._client is not None:
+        # A fault on command comes from another thread than what serves.
+        client, self._client = self._client, None
+        if client is not None:
             with contextlib.suppress(OSError):
-                self._client.shutdown(socket.SHUT_RDWR)
-            self._client.close()
-            self._client = None
+                client.shutdown(socket.SHUT_RDWR)
+            client.close()
