@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import os
 import time
+import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from typing import NamedTuple
 
-from benchmarks.row import Row
+from benchmarks.row import Row, failed
 
 # The long ones first: the processors are then busy to the end.
 RESULTS = (
@@ -37,9 +38,15 @@ def _processor_time() -> float:
 
 
 def measure(part: str, full: bool) -> Measured:
-    """All rows of one part."""
+    """All rows of one part; where it fails, a bar that is not cleared, after those before it."""
     begin, used = time.monotonic(), _processor_time()
-    rows = list(importlib.import_module(f"benchmarks.{part}").rows(full))
+    rows: list[Row] = []
+    try:
+        for row in importlib.import_module(f"benchmarks.{part}").rows(full):
+            rows.append(row)
+    except Exception as err:  # of many parts, the others are still worth having
+        traceback.print_exc()
+        rows.append(failed(f"{part}, to its end", f"{type(err).__name__}: {err}"))
     return Measured(part, rows, time.monotonic() - begin, _processor_time() - used)
 
 

@@ -72,6 +72,11 @@ def not_compared(name: str, unit: str, bar: str, why: str) -> Row:
     return _row(name, float("nan"), unit, None, why, bar, None)
 
 
+def failed(name: str, why: str) -> Row:
+    """What should have been measured, and was not."""
+    return _row(name, float("nan"), "", None, why, "runs", False)
+
+
 def _row(
     name: str,
     value: float,

@@ -2,15 +2,17 @@
 
 import ast
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.against_truth import band_held, coverage
 from benchmarks.cramer_rao import response_bounds
-from benchmarks.parts import PARTS
+from benchmarks.parts import PARTS, measure
 from benchmarks.parts import __file__ as parts_file
 from benchmarks.row import at_least, at_most, between, shown
 from omsm_ros.core.dynamics.calibration import REJECTED
@@ -115,6 +117,18 @@ def test_a_band_too_narrow_fails_however_many_runs_are_rejected(true_calibration
     assert rows["band held where accepted, it"]["value"] == 0.0
     assert rows["band held where accepted, it"]["holds"] is False
     assert rows["band held where rejected, it"]["runs"] == 6
+
+
+def test_a_part_that_fails_costs_its_own_figures_alone(monkeypatch, capsys):
+    def rows(full):
+        yield shown("before", 1.0, "1")
+        raise RuntimeError("no such peer")
+
+    monkeypatch.setitem(sys.modules, "benchmarks.broken", SimpleNamespace(rows=rows))
+    found = measure("broken", False).rows
+    assert [row["holds"] for row in found] == [None, False]
+    assert found[1]["peer"] == "RuntimeError: no such peer"
+    assert "no such peer" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", PARTS)
