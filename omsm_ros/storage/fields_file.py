@@ -51,7 +51,7 @@ def load_fields(path: Path | str) -> ScanFields:
             tuple(map(str, bounds)),
             tuple(map(str, aligned)),
         )
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as err:
         raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err
     shape = found.fields.shape
     if len(shape) != 2 or shape[0] != len(names) or found.every < 1:

@@ -64,8 +64,9 @@ def test_what_does_not_fit_is_refused_on_one_line(tmp_path, content):
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_archive_is_refused(tmp_path):
+@pytest.mark.parametrize("raw", [b"no archive", b""])
+def test_what_is_no_archive_is_refused(tmp_path, raw):
     path = tmp_path / "systematic.npz"
-    path.write_bytes(b"no archive")
+    path.write_bytes(raw)
     with pytest.raises(FileError, match="damaged"):
         load_fields(path)
