@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import io
 import os
@@ -34,6 +35,8 @@ DEMO = "demo"
 PASS_ON = ("batch",)
 
 
+# What the system says of a disk, without a name where it is said while reading.
+_OF_A_DISK = (errno.EIO, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.ESTALE)
 _WHAT_NEXT = """\
 omsm: measure optics on the machine that cut them, the dynamic error corrected.
 
@@ -174,10 +177,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _unforeseen(err: Exception) -> int:
     """Say what nobody foresaw; return the exit status."""
-    if isinstance(err, OSError) and err.filename is not None:
+    if isinstance(err, OSError) and (err.filename is not None or err.errno in _OF_A_DISK):
         # Of a place that the system refuses: a name too long, no permission, a broken disk.
-        path = quantities.shown(os.fsdecode(err.filename))
-        _say(f"{path}: {err.strerror}; check the path and its permissions")
+        path = "a file" if err.filename is None else quantities.shown(os.fsdecode(err.filename))
+        _say(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
     _say(defect(err))
     return DEFECT

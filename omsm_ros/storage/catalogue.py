@@ -111,7 +111,8 @@ class Catalogue:
             raise ConfigurationError(
                 f"catalogue: {said(err)}; pip install psycopg[binary]"
             ) from err
-        except self._sql.exc.SQLAlchemyError as err:
+        except (self._sql.exc.SQLAlchemyError, UnicodeDecodeError) as err:
+            # Of a damaged SQLite file, whose texts may be any bytes, the latter.
             raise FileError(
                 f"catalogue {self._shown_address()!r}: {self._reason(err)}; "
                 "check that it is there and may be written"

@@ -25,8 +25,8 @@ REMEDIES = (
     "check", "delete", "expected", "give", "use", "record", "identify", "write", "see", "call",
     "make", "move", "remove", "sample", "look", "plan", "choose", "leave", "convert", "start",
     "both are", "are needed", "reverse", "scan at", "name columns", "at least", "more than",
-    "set the", "needs",
-    "must", "state ", "thin it", "save it", "name the", "name each", "measure", "hold what",
+    "set the", "needs", "must", "state ", "thin it", "save it", "name the", "name it", "name each",
+    "measure", "hold what",
     "widen", "split it", "calibrate every", "end it in", "again",
     "correct the scan", "import the parts",
 )  # fmt: skip

@@ -217,7 +217,16 @@ def test_a_spindle_that_stands_makes_no_scan(place, speed):
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize(
     "path",
-    ["pipe", "folder", "/dev/zero", "loop", "none", "latin", pytest.param("n" * 300, id="long")],
+    [
+        "pipe",
+        "folder",
+        "/dev/zero",
+        "/proc/self/mem",
+        "loop",
+        "none",
+        "latin",
+        pytest.param("n" * 300, id="long"),
+    ],
 )
 @pytest.mark.parametrize(
     "words",

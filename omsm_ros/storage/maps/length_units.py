@@ -61,8 +61,8 @@ def needed(units: LengthUnits | None, what: str) -> LengthUnits:
     """Return ``units``; raise FileError, which calls the file ``what``, if nobody named them."""
     if units is None:
         raise FileError(
-            f"{what} does not say in which unit its numbers are; say it, as --unit mm, or "
-            "--unit mm,nm where the heights have another one"
+            f"{what} does not say in which unit its numbers are; state it, as --unit mm "
+            "(in a surface's file as unit: mm), or mm,nm where the heights have another one"
         )
     return units
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError, FileError
-from omsm_ros.storage.files import CLOUD, open_regular
+from omsm_ros.storage.files import CLOUD, open_regular, said
 from omsm_ros.storage.maps import hdf5_file, metropro_file
 from omsm_ros.storage.maps.columns_file import read_columns
 from omsm_ros.storage.maps.dabam_file import has_dabam_header, read_dabam
@@ -37,6 +37,8 @@ def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
         return _read(file, units)
     except DataError as err:
         raise FileError(f"map {str(file)!r}: {err}") from err
+    except OSError as err:
+        raise FileError(f"map {str(file)!r} cannot be read: {said(err)}; check the path") from err
 
 
 def _head(path: Path) -> bytes:
