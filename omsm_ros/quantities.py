@@ -242,6 +242,7 @@ WRAP = Quantity("counts at which an encoder wraps", "", 0, 2**62, "0 = as the de
 VOLTS_PER_METRE = Quantity("sensitivity", "V/m", 1.0, 1e9, "give it in volts per metre")
 VOLTS_PER_G = Quantity("sensitivity", "V/g", 1e-4, 100.0, "give it in volts per g")
 FULL_SCALE = Quantity("measuring range", "m", 1e-9, 10.0, "give it in metres")
+INTENSITY_READING = Quantity("intensity", "", -1e9, 1e9, "give the device's own reading")
 INTENSITY = Quantity("full intensity", "", 1e-9, 1e9, "give the device's own reading")
 PROBABILITY = Quantity("probability", "", 0.0, 1.0, "give a share between 0 and 1")
 PERCENT = Quantity("brightness", "%", 0.0, 100.0, "give it in per cent")

@@ -22,9 +22,10 @@ LONGEST_S = 5.0
 MOST_BYTES = 1024**3
 # Words of a remedy: what a message says to do.
 REMEDIES = (
-    "check", "delete", "expected", "give", "use", "record", "identify", "write", "see", "call",
-    "make", "move", "remove", "sample", "look", "plan", "choose", "leave", "convert", "start",
-    "both are", "are needed", "reverse", "scan at", "name columns", "at least", "more than",
+    "check", "delete", "expected", "give", "install", "use", "record", "identify", "write", "see",
+    "call", "make", "move", "remove", "sample", "look", "plan", "choose", "leave", "convert",
+    "start", "both are", "are needed", "reverse", "scan at", "name columns", "at least",
+    "more than",
     "set the", "needs", "must", "state ", "thin it", "save it", "name the", "name it", "name each",
     "measure", "hold what",
     "widen", "split it", "calibrate every", "end it in", "again",

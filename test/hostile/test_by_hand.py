@@ -18,6 +18,7 @@ from hostile import maps, trees
 from hostile.judge import Case, ask, judge
 
 from omsm_ros.errors import FileError
+from omsm_ros.storage.bags import DISTANCE_TOPIC, BagReader
 from omsm_ros.storage.files import save_text
 
 EXPORT = ("export", "{}", "--unit", "mm", "--out", "e.x3p")
@@ -162,6 +163,37 @@ def test_an_archive_of_zeros_is_not_unpacked(place):
         head = array.getvalue()[:-8].replace(b"(1,)", b"(999999999999,)")[:128]
         archive.writestr("t.npy", head + bytes(1000))
     refused(place, IMPORT, "a.npz", out.getvalue())
+
+
+def test_a_start_before_1970_is_refused(place):
+    table = b"n,d\n" + b"".join(b"%d,1e-6\n" % k for k in range(20))
+    columns = {"trigger": {"name": "n"}, "distance": {"name": "d", "unit": "m"}}
+    described = {"sample_period": 1e-3, "start": -1.8e9, "columns": columns}
+    (place / "t.yaml").write_text(json.dumps(described))
+    words = ("import", "{}", "--map", "t.yaml", "--out", "new.mcap")
+    assert "before 1970" in refused(place, words, "early.csv", table)
+
+
+def test_a_light_beyond_single_precision_is_no_light(place):
+    table = b"n,d,i\n" + b"".join(
+        b"%d,1e-6,%s\n" % (k, b"1e300" if k == 7 else b"80") for k in range(20)
+    )
+    columns = {"trigger": {"name": "n"}, "distance": {"name": "d", "unit": "m"},
+               "intensity": {"name": "i", "unit": "1"}}  # fmt: skip
+    (place / "i.yaml").write_text(json.dumps({"sample_period": 1e-3, "columns": columns}))
+    (place / "bright.csv").write_bytes(table)
+    words = ("import", "bright.csv", "--map", "i.yaml", "--out", "bright.mcap", "--json")
+    assert ask(Case(words), place).status == 0
+    with BagReader(place / "bright.mcap") as bag:
+        light = np.concatenate([block.intensity for _, _, block in bag.blocks(DISTANCE_TOPIC)])
+    assert np.flatnonzero(~np.isfinite(light)).tolist() == [7]
+
+
+def test_a_surface_that_no_point_lies_on_is_told_in_a_line(place):
+    """Of a height that is nowhere real, not one point is left to look at."""
+    words = ("form", "good.xyz", "--nominal", "{}", "--unit", "mm", "--out", "out")
+    surface = {"shape": "biconic", "radius_x": 0.1, "radius_y": 0.2, "conic_x": -1}
+    assert "do not settle" in refused(place, words, "b.yaml", json.dumps(surface).encode())
 
 
 def test_a_line_of_megabytes_is_quoted_shortly(place):

@@ -165,7 +165,7 @@ def _coarse(
     """Return the placement of least squares, points far from the others left out."""
     for turn in range(_MOST_TURNS):
         points = usable(placed(surface, at, chosen), aperture)
-        if turn:
+        if turn and len(points.x):
             middle = points.deviation - np.median(points.deviation)
             # Generous: what is left here is still the pose.
             points = points.part(np.abs(middle) <= max(8 * scatter.spread(middle), LEAST_LIMIT_M))

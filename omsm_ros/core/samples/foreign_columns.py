@@ -11,7 +11,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
 from omsm_ros.errors import DataError
-from omsm_ros.quantities import COUNTER, SAMPLE_PERIOD, STAMP, TIME
+from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
 from omsm_ros.units import (
     DEGREE_RAD,
     MICROMETRE_M,
@@ -323,7 +323,8 @@ def distance_blocks(
     status = np.where(lost, Status.NO_TARGET, Status.OK).astype(np.uint8)
     intensity = np.empty(0, np.float32)
     if mapped.has("intensity"):
-        intensity = _channel(table, mapped.columns["intensity"], count).astype(np.float32)
+        read = _channel(table, mapped.columns["intensity"], count)
+        intensity = INTENSITY_READING.or_lost(read).astype(np.float32)
     for part, stamp_ns, first in rows.parts():
         yield DistanceBlock(
             stamp_ns=stamp_ns,

@@ -102,11 +102,17 @@ class BagWriter:
     ) -> None:
         """Append one message as it came over the wire, received at ``stamp_ns``.
 
-        BagError if there is no room for it; what was written before stays readable.
+        BagError if there is no room for it, or for a stamp before 1970, which a bag cannot hold;
+        what was written before stays readable.
         """
         if self._failed:
             return
         published = stamp_ns if published_ns is None else published_ns
+        if (earliest := min(stamp_ns, published)) < 0:
+            raise BagError(
+                f"{topic!r}: the stamp {earliest} ns is before 1970, which no bag can hold; give "
+                "times since 1970, or a later start"
+            )
         self._writer.add_message(self._channels[topic], stamp_ns, bytes(cdr), published)
         self._taken += 1
         if self._file.waiting:  # a chunk is full
