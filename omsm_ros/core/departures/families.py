@@ -177,12 +177,17 @@ class Departures:
         # Mode by mode: a long record's spectra of all would be a gigabyte.
         rows = np.empty((2 * len(ladder), len(self.problem.input)))
         for place, (frequency, damping) in enumerate(ladder):
-            s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
-            mode = self._answer / (1 + 2 * damping * s + s * s)
-            for row, spectrum in enumerate((mode - self._answer, s * mode), 2 * place):
-                rows[row] = self._in_time(spectrum)
+            rows[2 * place : 2 * place + 2] = self.mode(frequency, damping).T
         frequencies, dampings = np.array(ladder).T
         return Family(MODE, frequencies, len(ladder) / 2, rows.T, dampings)
+
+    def mode(self, frequency: float, damping: float) -> FloatArray:
+        """Return the columns (n, 2) of the mode at ``frequency`` [Hz], as in :meth:`modes`."""
+        s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
+        mode = self._answer / (1 + 2 * damping * s + s * s)
+        return np.column_stack(
+            [self._in_time(spectrum) for spectrum in (mode - self._answer, s * mode)]
+        )
 
     def vibration(self) -> Family:
         """Return the sine and cosine at the strongest lines of the residual."""

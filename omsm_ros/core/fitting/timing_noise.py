@@ -7,6 +7,8 @@ lasts longer than a sample.
 
 from __future__ import annotations
 
+from math import comb
+
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
@@ -17,6 +19,10 @@ _CLEARLY = 5.0
 _LEAST_STILL = 200
 # Of the greatest rate squared: slower is at rest.
 _STILL = 1e-4
+# Orders of differences: what is left of a smooth motion falls with the order, noise does not.
+_SMOOTH, _SMOOTHER = 4, 8
+# By which two orders may differ; noise makes a tenth.
+_ALIKE = 0.2
 # Second differences of white noise share their noise: Σ ρ² over all lags.
 _SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
 
@@ -50,3 +56,28 @@ def _lasts(on_grid: FloatArray, rate: FloatArray) -> bool:
     product = value[1:] * value[:-1]
     spread = float(np.sqrt(np.sum(product**2)))
     return bool(np.sum(product) > _CLEARLY * spread)
+
+
+def motion_scatter(motion: FloatArray, rate: FloatArray) -> float:
+    """Return the standard deviation [s] of the time of a reading of ``motion`` (n,) itself.
+
+    0 where it does not show, or where the motion is too sharp for its samples to tell.
+    rate: of the motion (n,) [m/s]
+
+    The instant of a reading of the axes passes through the response, so that what it leaves in a
+    residual lasts. Between the readings of one smooth motion it does not.
+    """
+    rough, smooth = (_scatter_of_differences(motion, rate, n) for n in (_SMOOTH, _SMOOTHER))
+    return smooth if abs(rough - smooth) < _ALIKE * smooth else 0.0
+
+
+def _scatter_of_differences(motion: FloatArray, rate: FloatArray, order: int) -> float:
+    kernel = np.array([(-1.0) ** i * comb(order, i) for i in range(order + 1)])
+    kernel /= np.linalg.norm(kernel)
+    square = np.convolve(motion, kernel, "valid") ** 2
+    weight = np.convolve(rate**2, kernel**2, "valid")
+    still = weight < _STILL * np.max(weight, initial=0.0)
+    if np.sum(still) < _LEAST_STILL:
+        return 0.0
+    excess = float(np.sum(weight * (square - np.mean(square[still]))))
+    return float(np.sqrt(max(excess, 0.0) / np.sum(weight**2)))

@@ -32,18 +32,20 @@ _LEAST_TRUSTED_HZ = 5.0
 _CLEARLY = 5.0
 
 
-def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Finding:
+def misfit(
+    chi_square: float, noise: float, clearly_better: int | None, axis_timing: float = 0.0
+) -> Finding:
     """Compare the mean square of the residual where the axis moves with that of the noise.
 
     chi_square: their ratio [1];  noise: standard deviation of a reading [m]
     clearly_better: number of poles that the data ask for instead of the order given, or None
+    axis_timing: scatter in time of the axis's readings [s]
     """
     reasons = []
     if chi_square > _WORST_CHI_SQUARE:
         reasons.append(
             f"where the axis moves the residual is {plain(chi_square)} times the noise of "
-            f"{quantity(noise, 'm')} squared: the model misses something; "
-            + _what_to_check(clearly_better)
+            f"{quantity(noise, 'm')} squared: " + _what_to_check(clearly_better, axis_timing)
         )
     if chi_square < _LEAST_CHI_SQUARE:
         reasons.append(
@@ -55,15 +57,16 @@ def misfit(chi_square: float, noise: float, clearly_better: int | None) -> Findi
     return Finding({"chi_square": chi_square, "noise_m": noise}, limits, tuple(reasons))
 
 
-def timing(scatter: float) -> Finding:
-    """Reserve a record whose readings scatter in time by ``scatter`` [s]."""
-    if scatter == 0:
-        return Finding({"timing_scatter_s": 0.0})
+def timing(scatter: float, of_axis: float = 0.0) -> Finding:
+    """Reserve a record whose readings scatter in time by ``scatter`` [s], or the axis's."""
+    entries = {"timing_scatter_s": scatter, "axis_timing_scatter_s": of_axis}
     return Finding(
-        {"timing_scatter_s": scatter},
-        reservations=(
-            f"the readings scatter in time by {quantity(scatter, 's')}: in a scan they are "
-            "noisier by that times the speed along Z; latch encoder and probe by one trigger",
+        entries,
+        reservations=tuple(
+            f"the readings{whose} scatter in time by {quantity(found, 's')}: in a scan they are "
+            "noisier by that times the speed along Z; latch encoder and probe by one trigger"
+            for whose, found in (("", scatter), (" of the axis", of_axis))
+            if found > 0
         ),
     )
 
@@ -106,12 +109,18 @@ def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: floa
     )
 
 
-def _what_to_check(clearly_better: int | None) -> str:
+def _what_to_check(clearly_better: int | None, axis_timing: float) -> str:
     if clearly_better is not None:
         return (
-            f"the order asked for is wrong, {clearly_better} poles describe the record far better"
+            "the model misses something; the order asked for is wrong, "
+            f"{clearly_better} poles describe the record far better"
         )
-    return "check for backlash, a loose mount or a clipped probe"
+    if axis_timing > 0:
+        return (
+            f"the readings of the axis scatter in time by {quantity(axis_timing, 's')}; latch "
+            "encoder and probe by one trigger, and repeat the test"
+        )
+    return "the model misses something; check for backlash, a loose mount or a clipped probe"
 
 
 def separable_gain(uncertainty: float, limit: float) -> Finding:
@@ -181,17 +190,21 @@ def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float)
 CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     # What the motion cannot tell makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
-    lambda e: misfit(e.residual.chi_square, e.residual.noise, e.known.clearly_better),
+    lambda e: misfit(
+        e.residual.chi_square, e.residual.noise, e.known.clearly_better, e.residual.axis_timing
+    ),
     lambda e: lead(
         e.dynamics.low_frequency_delay,
         low_frequency_delay_uncertainty(e.dynamics, e.known.covariance),
         e.prepared.steps.noise,
         e.residual.noise,
     ),
-    lambda e: timing(e.residual.timing),
+    lambda e: timing(e.residual.timing, e.residual.axis_timing),
     lambda e: two_clocks(e.record.by_stamps),
     lambda e: departures(e.searched),
-    lambda e: independence(e.searched.survey.independence),
+    lambda e: independence(
+        e.searched.survey.independence, max(e.residual.timing, e.residual.axis_timing)
+    ),
     lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),
 )
 """What may be wrong with the record or the model."""

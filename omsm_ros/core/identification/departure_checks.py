@@ -164,15 +164,23 @@ def _unmodelled(judged: Judged) -> str:
     )
 
 
-def independence(p_value: float) -> Finding:
-    """Reject a residual that follows the rate of the motion, see ``residual_tests``."""
+def independence(p_value: float, scatter: float = 0.0) -> Finding:
+    """Reject a residual that follows the rate of the motion, see ``residual_tests``.
+
+    scatter: of the readings in time [s]: behind it the structure shows badly
+    """
     reasons: tuple[str, ...] = ()
     if p_value < FALSE_ALARM:
-        reasons = (
-            f"the residual follows the motion (by chance: {chance(p_value)}): the machine "
-            "does not answer linearly, or differently each time; look for what is loose or rubs, "
-            "and compare with smaller steps",
+        cause = (
+            "the machine does not answer linearly, or differently each time; look for what is "
+            "loose or rubs, and compare with smaller steps"
         )
+        if scatter > 0:
+            cause = (
+                f"readings that scatter in time by {quantity(scatter, 's')} hide the response; "
+                "latch encoder and probe by one trigger, and repeat the test"
+            )
+        reasons = (f"the residual follows the motion (by chance: {chance(p_value)}): {cause}",)
     return Finding({"independence_p": p_value}, {"independence_p_least": FALSE_ALARM}, reasons)
 
 

@@ -69,6 +69,7 @@ class Searched:
 
     beside: departures in the background;  in_response: those that became poles
     unmodelled: significant, but no model describes them;  survey: of the last fit
+    without: survey of the fit before each of ``in_response`` was added
     """
 
     prepared: Prepared
@@ -77,6 +78,7 @@ class Searched:
     beside: Sequence[ModelledTerm] = ()
     in_response: Sequence[Term] = ()
     unmodelled: Sequence[Judged] = ()
+    without: Sequence[Survey] = ()
 
 
 Choose = Callable[[Prepared], tuple[Prepared, Model]]
@@ -95,6 +97,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
         beside += added
         prepared, model = choose(prepared)
     grown: list[Term] = []
+    without: list[Survey] = []
     settled: set[str] = set()
     modes: list[float] = []
     refused: set[str] = set() if may_grow else {CREEP, MODE}
@@ -113,7 +116,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
             prepared, added = _with_columns(prepared, columns, beside)
             beside += added
             prepared, model = choose(prepared)
-            grown = []
+            grown, without = [], []
         else:
             larger = _grown(prepared, model, shown[0].term)
             modes += [shown[0].term.parameter] if shown[0].term.family == MODE else []
@@ -122,8 +125,9 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
                 continue
             prepared, model = larger
             grown.append(_as_fitted(shown[0].term, model.chosen.fit))
+            without.append(survey)
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
-    return Searched(prepared, model, survey, beside, grown, survey.significant(settled))
+    return Searched(prepared, model, survey, beside, grown, survey.significant(settled), without)
 
 
 def _drift(prepared: Prepared) -> list[Judged]:

@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from omsm_ros.core.departures.families import CREEP, MODE
+from omsm_ros.core.departures.families import CREEP, MODE, Term
 from omsm_ros.core.departures.hidden import HiddenTerm, hidden_terms, with_slower_creep
+from omsm_ros.core.departures.other_modes import spread_of_modes
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.fitting.output_error import Fit
@@ -60,6 +61,20 @@ def hidden_covariance(
     )
     return [CovarianceTerm(c) for c in covariance] + [
         CovarianceTerm(np.zeros((_size(survey.fitted),) * 2), finding)
+    ]
+
+
+def other_modes(
+    without: Sequence[Survey], terms: Sequence[Term], fitted: Fit
+) -> list[CovarianceTerm]:
+    """Return the terms of what each light mode among ``terms`` may be instead.
+
+    without: survey of the fit before each of ``terms`` became a part of ``fitted``
+    """
+    return [
+        CovarianceTerm(spread_of_modes(before, term, fitted))
+        for before, term in zip(without, terms, strict=True)
+        if term.family == MODE
     ]
 
 

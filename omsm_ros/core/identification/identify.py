@@ -34,7 +34,7 @@ from omsm_ros.core.identification.covariance_terms import reference_delay
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
-from omsm_ros.core.identification.hidden_terms import hidden_covariance
+from omsm_ros.core.identification.hidden_terms import hidden_covariance, other_modes
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.identification.two_masses import table_mass
@@ -110,6 +110,7 @@ def identify(
     check_gain(model.chosen.fit.gain)
     drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]
     hidden = hidden_covariance(searched.survey, settings or {}, limits, drift)
+    hidden += other_modes(searched.without, searched.in_response, model.chosen.fit)
     hidden += [consistency(searched.survey)]
     hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
     known = response_uncertainty(prepared, model, limits, hidden)

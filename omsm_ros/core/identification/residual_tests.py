@@ -17,6 +17,7 @@ from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.reading_steps import reading_step
 from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.fitting.timing_noise import motion_scatter
 from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import orthonormal
@@ -29,6 +30,10 @@ _AFTER_EDGE_S = 50e-3
 _LEAST_REST_SAMPLES = 200
 # Then it is known to a tenth.
 _LEAST_CROSSINGS = 50
+# Up to half the sampling rate, for the mean power of a response.
+_LINES = 500
+# Shares of an excess that explain it, and of the noise that are worth telling.
+_MOST, _SHOWS = 0.5, 0.1
 # No probe tells less; a misfit below it is none.
 _FINEST_READING_M = 1e-10
 
@@ -37,6 +42,7 @@ _FINEST_READING_M = 1e-10
 class ResidualTests:
     """chi_square: mean square where the axis moves over that of noise;  noise: [m]
     timing: standard deviation of the time of a reading [s], 0 where it does not show
+    axis_timing: that of a reading of the axis, 0 where it explains nothing of the residual
     whiteness: p-value, small where the residual is coloured
     """
 
@@ -44,6 +50,7 @@ class ResidualTests:
     noise: float
     timing: float
     whiteness: float
+    axis_timing: float = 0.0
 
 
 def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests:
@@ -70,7 +77,23 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
         noise,
         float(np.sqrt(timing)),
         whiteness(fitted.residual),
+        _axis_timing(problem, fitted, moves, chi_square * expected - noise**2, noise),
     )
+
+
+def _axis_timing(
+    problem: Problem, fitted: Fit, moves: BoolArray, excess: float, noise: float
+) -> float:
+    """Return how the axis's readings scatter in time [s], if that explains most of ``excess``.
+
+    excess: of the mean square of the residual where ``moves`` (n,), over ``noise``² [m²]
+    """
+    rate = rate_of(problem)
+    scatter = motion_scatter(problem.input, rate)
+    lines = np.linspace(0.0, 0.5 / problem.period, _LINES)
+    passed = float(np.mean(np.abs(fitted.gain * fitted.dynamics.response(lines)) ** 2))
+    makes = scatter**2 * float(np.mean(rate[moves] ** 2)) * passed
+    return scatter if makes > max(_MOST * excess, _SHOWS * noise**2) else 0.0
 
 
 def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:

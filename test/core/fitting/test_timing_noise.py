@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import signal
 
-from omsm_ros.core.fitting.timing_noise import timing_variance
+from omsm_ros.core.fitting.timing_noise import motion_scatter, timing_variance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
@@ -55,3 +56,33 @@ def test_a_probe_that_scatters_is_accepted_and_told_so(seed):
     (told,) = certificate["reservations"]
     assert "scatter in time by" in told
     assert certificate["chi_square"] < 1.2
+
+
+@pytest.mark.parametrize("scatter", [10e-6, 50e-6])
+def test_the_axis_itself_shows_how_its_readings_scatter(scatter):
+    rng = np.random.default_rng(3)
+    z = TEST.positions(TIME + rng.normal(0, scatter, len(TIME))).z
+    z = z + rng.normal(0, 0.3e-9, len(TIME))
+    assert motion_scatter(z, np.gradient(z, PERIOD)) == pytest.approx(scatter, rel=0.15)
+
+
+@pytest.mark.parametrize("rise", [3e-3, 5e-3, 10e-3, 20e-3])
+def test_edges_however_sharp_are_no_scatter(rise):
+    rng = np.random.default_rng(4)
+    z = StepTest(rise=rise).positions(TIME).z + rng.normal(0, 0.3e-9, len(TIME))
+    assert motion_scatter(z, np.gradient(z, PERIOD)) < 3e-6
+
+
+def test_an_axis_that_scatters_is_named_as_the_cause():
+    """Behind a structure what its readings scatter by lasts, and looks like a loose mount."""
+    rng = np.random.default_rng(1)
+    z = TEST.positions(TIME + rng.normal(0, SCATTER_S, len(TIME))).z
+    omega = 2 * np.pi * 62.0
+    system = signal.cont2discrete(([omega**2], [1, 0.16 * omega, omega**2]), PERIOD, "foh")
+    seen = signal.lfilter(system[0].ravel(), system[1], TEST.positions(TIME).z)
+    record = MotionRecord.from_arrays(PERIOD, z, -seen + rng.normal(0, 10e-9, len(TIME)))
+    certificate = identify(record).calibration.certificate
+    assert certificate["axis_timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
+    told = [*certificate["reasons"], *certificate["reservations"]]
+    assert any("readings of the axis scatter in time" in text for text in told)
+    assert not any("loose" in text for text in certificate["reasons"])

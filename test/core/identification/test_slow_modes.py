@@ -2,21 +2,24 @@
 
 import numpy as np
 import pytest
-from late_steps import LAG, LATE, PERIOD, TIME, late_record
+from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 from scipy import signal
 
 from omsm_ros.core.departures.families import MODE, VIBRATION
+from omsm_ros.core.departures.other_modes import spread_of_modes
 from omsm_ros.core.dynamics.response_band import response_band
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.samples.motion_record import MotionRecord
 
 
-def ringing(participation, frequency, damping):
+def ringing(participation, frequency, damping, late=LATE):
     omega = 2 * np.pi * frequency
     mode = signal.cont2discrete(([omega**2], [1, 2 * damping * omega, omega**2]), PERIOD, "foh")
-    return participation * (signal.lfilter(mode[0].ravel(), mode[1], LATE - LATE[0]) - LATE)
+    return participation * (signal.lfilter(mode[0].ravel(), mode[1], late - late[0]) - late)
 
 
 @pytest.mark.parametrize(("seed", "modelled"), [(1, False), (2, True)])
@@ -33,6 +36,39 @@ def test_a_slow_mode_that_the_steps_keep_ringing_is_in_the_response_or_in_the_ba
     band = response_band(calibration.dynamics, calibration.covariance, lines)
     off = np.abs(np.log(calibration.dynamics.response(lines) / truth))
     assert np.all(off < 3 * np.hypot(band.gain, band.phase))
+
+
+def test_a_mode_between_the_teeth_of_even_steps_is_no_surer_than_which_mode_it_is():
+    """Steps every second show 1.7 Hz by its neighbours: several modes fit about as well."""
+    size, frequency, damping = 1e-4, 1.7, 0.05
+    steps = StepTest(dwell=1.0)
+    time = np.arange(round(steps.duration / PERIOD)) * PERIOD
+    late = steps.positions(time - LAG).z
+    random = np.random.default_rng(1)
+    seen = -late - ringing(size, frequency, damping, late) + random.normal(0, NOISE, len(time))
+    z = steps.positions(time).z + random.normal(0, 0.3e-9, len(time))
+    found = search(prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder"), model_from_start)
+    (mode,), (without,) = found.in_response, found.without
+    fitted = found.model.chosen.fit
+    lines = np.linspace(1.2, 2.0, 40)
+    spread = response_band(fitted.dynamics, spread_of_modes(without, mode, fitted), lines)
+    ratio = 1j * lines / frequency
+    truth = np.exp(-2j * np.pi * lines * LAG) * (
+        1 + size * (1 / (1 + 2 * damping * ratio + ratio**2) - 1)
+    )
+    off = np.abs(np.log(fitted.dynamics.response(lines) / truth))
+    assert np.max(off) > 2e-4
+    assert np.all(off < 3 * np.max(np.hypot(spread.gain, spread.phase)))
+
+
+def test_a_mode_that_shows_clearly_is_no_other():
+    clear = search(prepare(late_record(-ringing(1e-3, 8.0, 0.05), 1), "encoder"), model_from_start)
+    (mode,), (without,) = clear.in_response, clear.without
+    fitted = clear.model.chosen.fit
+    spread = response_band(
+        fitted.dynamics, spread_of_modes(without, mode, fitted), np.array([0.5, 1.0, 2.0])
+    )
+    assert np.max(np.hypot(spread.gain, spread.phase)) < 1e-5
 
 
 def test_a_slow_line_of_vibration_is_no_mode():
