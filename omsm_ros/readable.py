@@ -46,7 +46,7 @@ def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) ->
     if known is None:
         return NOTHING
     # Rounded first: 999.96 becomes 1.00 k, not 1000.
-    rounded = float(f"{known:.{digits - 1}e}")
+    rounded = _rounded(known, digits)
     exponent = _exponent(rounded, unit)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
     sign = "+" if signed and rounded > 0 else ""
@@ -65,7 +65,7 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
     if not spread or spread < 0:
         return quantity(known, unit, digits) if unit else plain(known, digits)
     # Rounded first: an uncertainty of 0.996 is one of 1.0.
-    spread = float(f"{spread:.1e}")
+    spread = _rounded(spread, 2)
     exponent = _exponent(max(abs(known), spread), unit)
     decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
@@ -140,6 +140,12 @@ def chance(value: object) -> str:
 def raised(power: int) -> str:
     """Return a power as a superscript."""
     return str(power).translate(_SUPERSCRIPTS)
+
+
+def _rounded(value: float, digits: int) -> float:
+    """Return the number to so many digits; the largest of all are not rounded up to infinity."""
+    rounded = float(f"{value:.{digits - 1}e}")
+    return rounded if math.isfinite(rounded) else value
 
 
 def _exponent(value: float, unit: str) -> int:

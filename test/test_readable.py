@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from datetime import datetime, timedelta, timezone
 
 import pytest
@@ -201,3 +202,9 @@ def test_a_chance_in_a_sentence():
 def test_a_moment_is_given_in_utc():
     summer = timezone(timedelta(hours=2))
     assert moment(datetime(2026, 7, 1, 1, 30, tzinfo=summer)) == "2026-06-30 23:30 UTC"
+
+
+def test_the_largest_of_all_numbers_is_shown_and_not_rounded_up_to_infinity():
+    largest = sys.float_info.max
+    for text in (quantity(largest, "m"), measured(1.0, largest, "m"), percent(largest)):
+        assert "inf" not in text

@@ -339,4 +339,5 @@ def distance_blocks(
 def _channel(table: Mapping[str, FloatArray], column: Column, rows: int) -> FloatArray:
     if not column.name:
         return np.full(rows, column.constant)
-    return np.asarray(table[column.name] * column.factor)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is told by who reads it
+        return np.asarray(table[column.name] * column.factor)

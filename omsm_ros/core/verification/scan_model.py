@@ -179,4 +179,7 @@ class _Drift:
 
 def _turns(scan: ScanColumns) -> float:
     period = float(np.median(np.diff(scan.time)))
-    return float(np.sum(np.abs(scan.angular_rate))) * period / (2 * np.pi)
+    turns = float(np.sum(np.abs(scan.angular_rate))) * period / (2 * np.pi)
+    if not np.isfinite(turns):
+        raise DataError("the pace of C is not known at every point of a scan; record it again")
+    return turns
