@@ -3,12 +3,21 @@
 And their order: several processes share the tests, a file each, and files with nodes mostly wait.
 """
 
+import signal
+
 import pytest
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+
+
+def pytest_configure():
+    """A shell in the background ignores SIGINT, and so would every node that a test starts."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 # A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000.
 SMALL = Scenario(start_radius=2e-3)
