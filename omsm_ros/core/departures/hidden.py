@@ -36,9 +36,11 @@ _DECADES = 3.0
 # What creeps within the record creeps on beyond it, about as much in each of three decades from
 # none to all: a uniform distribution, whose standard deviation is 1/√3 of its end.
 _UNSEEN = _DECADES / 3**0.5
-# A joint or a piezo goes on creeping for minutes, whatever a record lasts. Of what is slower than
-# ten records not even its beginning shows.
-_SLOWEST_CREEP_S, _MOST_RECORDS = 100.0, 10.0
+# A joint or a piezo goes on creeping for a minute, whatever a record lasts; what is slower moves
+# by less in a scan. Of what is slower than ten records not even its beginning shows. A drift of
+# 100 nm a minute may be a relaxation of 50 s and 0.17 %; of 100 s, it would be twice that, and a
+# warm machine could not be calibrated.
+_SLOWEST_CREEP_S, _MOST_RECORDS = 50.0, 10.0
 # Probability by chance below which a mode is carried that is not significant.
 _HINT = 0.05
 # Of the background: the drift that every fit has.
@@ -111,7 +113,7 @@ def _taken_for_noise(drift: Sequence[slice]) -> list[Sequence[slice]]:
 
 
 def with_slower_creep(survey: Survey) -> Survey:
-    """Return ``survey`` with relaxations of minutes, or as slow as this record is long."""
+    """Return ``survey`` with relaxations of a minute, or as slow as this record is long."""
     slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / survey.departures.duration)
     return replace(survey, slower=max(slower, 1.0))
 
