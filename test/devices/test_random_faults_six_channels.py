@@ -20,11 +20,10 @@ from omsm_ros.protocols.generic_stream import FRAME, FrameArray, StreamScaling, 
 from .conftest import Bench
 from .test_random_faults import (
     LASTS_S,
+    MEMORY_FAULTS,
     NOTICED_S,
     Kind,
     Story,
-    count,
-    lasting,
     play,
     sequences,
     stories,
@@ -146,23 +145,12 @@ def ring_bench(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 STREAM = Kind(SixChannels, GenericStreamDevice, StreamSettings(), checked=True, modulus=2**32)
 PLC = Kind(Plc, GenericStreamDevice, StreamSettings(), checked=True, modulus=2**32)
-# A memory has neither noise nor cuts, and nobody asks it anything.
-RING_FAULTS = (
-    count("lose", 40),
-    count("duplicate", 40),
-    count("saturate", 40),
-    count("drop_out", 40),
-    lasting("unplug"),
-    lasting("power_cycle"),
-    lasting("stall"),
-    st.just(lambda i: i.restart()),
-    st.just(lambda i: i.reset_counter()),
-    st.integers(0, 2**31).map(lambda ns: lambda i: i.step_clock(ns)),
-)
 
 
 def ring_stories() -> st.SearchStrategy[Story]:
-    return st.lists(st.tuples(st.one_of(RING_FAULTS), st.floats(0.0, 1.5)), min_size=1, max_size=6)
+    return st.lists(
+        st.tuples(st.one_of(MEMORY_FAULTS), st.floats(0.0, 1.5)), min_size=1, max_size=6
+    )
 
 
 @sequences(4)
