@@ -14,6 +14,8 @@ MAX_PIXELS = 400
 _POINTS_PER_PIXEL = 2
 # Beyond any image, and its square still a whole number.
 _FAR = 10_000
+# Of the steps from pixel to pixel along rows and columns, those that cross from track to track.
+_CROSSING = 0.65
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,14 +70,20 @@ def _close_gaps(total: FloatArray, count: FloatArray) -> FloatArray:
 
 def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
     """Return pixels to the nearest filled one, exact up to the reach of a gap to be closed."""
-    within = 2
-    while True:
-        away = distances(filled, within)
-        # Between tracks a pixels apart half of all pixels are within a/4 of one.
-        reach = max(2.5 * float(np.median(away)), 1.5)
-        if reach <= within or within >= max(filled.shape):
-            return away, reach
-        within *= 2
+    steps = np.concatenate([_steps(filled), _steps(filled.T)])
+    if not len(steps):
+        return distances(filled, 2), 1.5
+    # Along straight tracks half of all steps are of one pixel; the rest cross from one to the
+    # next. A hole, however large, is crossed once in a row and counts as one step of many.
+    between = float(np.quantile(steps, _CROSSING))
+    reach = max(0.55 * between, 1.5)
+    return distances(filled, int(np.ceil(reach))), reach
+
+
+def _steps(filled: NDArray[np.bool_]) -> IntArray:
+    """Return pixels from each filled one of an image to the next filled one of its row."""
+    row, column = np.nonzero(filled)
+    return np.diff(column)[np.diff(row) == 0]
 
 
 def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:

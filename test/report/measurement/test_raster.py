@@ -53,6 +53,35 @@ def test_a_dropout_stays_a_hole():
     assert np.all(raster.image[np.hypot(px + 3e-3, py) < 0.8e-3] == pytest.approx(1.0))
 
 
+@pytest.mark.parametrize(("points", "turns"), [(120_000, 45), (254_000, 127), (300_000, 14)])
+@pytest.mark.parametrize("inner", [0.5, 0.72, 0.93])
+def test_a_ring_ends_where_its_tracks_end(points, turns, inner):
+    share = np.arange(points) / points
+    r, angle = 1e-2 * (1 - (1 - inner) * share), 2 * np.pi * turns * share
+    raster = rasterise(r * np.cos(angle), r * np.sin(angle), r)
+    radius = np.hypot(*centres(raster))
+    pitch = (raster.extent[1] - raster.extent[0]) / raster.image.shape[1]
+    track = max(1e-2 * (1 - inner) / turns, 1.5 * pitch)
+    between = (radius > inner * 1e-2 + track) & (radius < 1e-2 - track)
+    assert np.all(np.isfinite(raster.image[between]))
+    outside = (radius < inner * 1e-2 - 2 * track) | (radius > 1e-2 + 2 * track)
+    assert np.all(np.isnan(raster.image[outside]))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, np.pi / 2])
+def test_lines_beside_each_other_are_closed_and_what_lies_beyond_is_not(turn):
+    along, across = np.meshgrid(np.linspace(-1e-2, 1e-2, 10_000), np.linspace(2e-3, 9e-3, 24))
+    u, v = along.ravel(), across.ravel()
+    x, y = u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn)
+    raster = rasterise(np.append(x, -x), np.append(y, -y), np.append(u, -u))
+    px, py = centres(raster)
+    v, u = py * np.cos(turn) - px * np.sin(turn), px * np.cos(turn) + py * np.sin(turn)
+    track = 7e-3 / 23
+    covered = (abs(v) > 2.2e-3) & (abs(v) < 8.8e-3) & (abs(u) < 9.8e-3)
+    assert np.all(np.isfinite(raster.image[covered]))
+    assert np.all(np.isnan(raster.image[abs(v) < 2e-3 - 1.5 * track]))
+
+
 def test_a_pixel_is_the_mean_of_its_points():
     x = np.repeat(np.linspace(0, 1, 41), 100)
     y = np.tile(np.linspace(0, 1, 100), 41)
