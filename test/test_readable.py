@@ -153,7 +153,7 @@ def test_what_is_no_number_is_a_dash(value):
     assert count(value) == NOTHING
 
 
-@given(st.floats(1e-9, 1e8) | st.floats(-1e8, -1e-9))
+@given(st.floats(1e-4, 1e8) | st.floats(-1e8, -1e-4))
 def test_a_quantity_reads_back(value):
     number, unit = quantity(value, "Hz").split(" ")
     assert float(number) * FACTORS[unit.removesuffix("Hz")] == pytest.approx(value, rel=5.1e-3)
@@ -208,3 +208,16 @@ def test_the_largest_of_all_numbers_is_shown_and_not_rounded_up_to_infinity():
     largest = sys.float_info.max
     for text in (quantity(largest, "m"), measured(1.0, largest, "m"), percent(largest)):
         assert "inf" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "expected"),
+    [
+        (3.19e-13, "m", "0.000319 nm"),
+        (-2.49e-14, "m", "-2.49 · 10⁻⁵ nm"),
+        (5.5e-14, "%", "5.50 · 10⁻¹⁴ %"),
+        (3.1e-20, "rad", "3.10 · 10⁻¹¹ nrad"),
+    ],
+)
+def test_no_row_of_zeros_has_to_be_counted(value, unit, expected):
+    assert quantity(value, unit) == expected

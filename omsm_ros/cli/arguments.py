@@ -119,6 +119,17 @@ def add_trigger(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def add_polarity(sub: argparse.ArgumentParser) -> None:
+    """Declare which way the distance of a bag goes."""
+    sub.add_argument(
+        "--polarity",
+        type=int,
+        choices=(1, -1),
+        default=1,
+        help="1: the distance falls as z rises; -1: it rises",
+    )
+
+
 def add_by_stamps(sub: argparse.ArgumentParser) -> None:
     """Declare that axes and probe share no counter."""
     sub.add_argument(

@@ -44,11 +44,13 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
   see it all on a twin          omsm demo --out out/demo
   bags to try things out        omsm twin --out trial/
   on a machine, plan a test     omsm plan steps --out plan/
+  your own CSV, HDF5, MATLAB …  omsm import log.csv --map map.yaml --out steps.mcap
   what is in a recording?       omsm inspect steps.mcap
   identify the dynamics         omsm identify steps.mcap --out cal.json --report certificate/
   how fast may a scan be?       omsm predict scan.csv --calibration cal.json
   correct a scan                omsm correct scan.mcap --calibration cal.json --out result/
   what shape is the part?       omsm form result/ --nominal mirror.yaml --out form/
+  a folder full of scans        omsm batch scans/ --calibration cal.json --out week/
 
 'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
 

@@ -12,6 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
     add_bags,
     add_by_stamps,
+    add_polarity,
     add_trigger,
     cell_of,
     json_object,
@@ -87,7 +88,7 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
     )
     add_trigger(sub)
     sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
-    sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
+    add_polarity(sub)
     sub.add_argument(
         "--override", action="store_true", help="use a calibration that does not belong; recorded"
     )

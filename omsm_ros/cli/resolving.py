@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, cell_of, json_object, number
+from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
@@ -44,7 +44,7 @@ def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
         default=DEFAULT_CLOCKING_RAD,
         help="standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
     )
-    sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
+    add_polarity(sub)
     sub.add_argument(
         "--static-gain",
         type=number(quantities.GAIN),

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, cell_of, json_object, number
+from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, progress_bar, table
 from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.readable import plain, quantity
@@ -29,7 +29,7 @@ def _declare_spectrum(sub: argparse.ArgumentParser) -> None:
         help="take this band out of the heights, without phase; may be repeated",
     )
     sub.add_argument("--settings", type=json_object, metavar="JSON", help="of these scans")
-    sub.add_argument("--polarity", type=int, choices=(1, -1), default=1)
+    add_polarity(sub)
     sub.add_argument("--no-report", action="store_true", help="results only")
     sub.add_argument(
         "--override", action="store_true", help="use a calibration that does not belong; recorded"

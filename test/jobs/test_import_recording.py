@@ -320,7 +320,7 @@ def test_a_pickle_is_not_opened(tmp_path):
         ("columns: {distance: {name: d, unit: count}}\nsample_period: 1", "what is one count"),
         ("columns: {distance: {name: d, unit: count, count: 5}}\nsample_period: 1", "one count is"),
         ("columns: {distance: {name: d, unit: um}}", "neither sample_period nor"),
-        ("columns: {z: {name: d, unit: um}}\nsample_period: 1", "'x' has no column"),
+        ("columns: {z: {name: d, unit: um}}\nsample_period: 1", "no column for x, y, b, c"),
         ("columns: {q: {name: d, unit: um}}\nsample_period: 1", "'q' is unknown"),
         ("columns: {distance: {name: d, unit: um, constant: 0}}\nsample_period: 1", "one of them"),
         ("columns: {x: {constant: 3}}\nsample_period: 1", "x has no unit"),

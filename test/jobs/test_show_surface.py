@@ -24,6 +24,14 @@ def test_extent_and_slope_are_those_of_the_sphere():
     assert "angle of the probe to the surface" in found["not_evaluated"]
 
 
+@pytest.mark.parametrize("surface", [Sphere(0.5), Sphere(0.02), Asphere(0.02)])
+def test_a_round_part_asks_for_no_motion_but_the_feed(surface):
+    found = show_surface(surface, SCAN, MachineLimits())
+    limit = next(each for each in found["limits"] if each["name"] == "motion frequency")
+    assert limit["value"] == 0.0
+    assert found["axes_can_follow"]
+
+
 @pytest.mark.parametrize(("angle", "follows"), [(0.1, False), (0.3, True)])
 def test_the_probe_follows_up_to_its_angle(angle, follows):
     assert show_surface(Sphere(0.05), SCAN, MachineLimits(), angle)["probe_can_follow"] is follows

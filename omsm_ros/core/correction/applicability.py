@@ -56,8 +56,8 @@ def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) ->
     if reasons and not override:
         raise CalibrationError(
             f"calibration {calibration.id[:12]} does not belong to these data: "
-            f"{'; '.join(reasons)}. Set the cell as it was, identify again, or override "
-            "explicitly"
+            f"{'; '.join(reasons)}. Set the cell as it was, identify again, or use it all the same "
+            "(--override; parameter override)"
         )
     return {"calibration": calibration.id, "objections": list(reasons), "overridden": bool(reasons)}
 
@@ -72,7 +72,12 @@ def _certificate(calibration: Calibration, polarity: int | None) -> list[str]:
         found.append(f"its certificate says {verdict!r}{_reasons(certificate)}")
     certified = certificate.get("polarity")
     if polarity is not None and certified is not None and certified != polarity:
-        found.append(f"polarity is {polarity!r}, calibrated with {certified!r}")
+        moves = "rises" if certified == -1 else "falls"
+        found.append(
+            f"polarity is {polarity!r}, calibrated with {certified!r} (the distance {moves} as z "
+            "rises): turn the sign of distance where both recordings come from (map, driver), or "
+            f"state polarity {certified} (--polarity {certified})"
+        )
     return found
 
 

@@ -138,8 +138,8 @@ class ColumnMap:
         lacking = [a for a in AXES if a not in self.columns]
         if "z" in self.columns and lacking:
             raise DataError(
-                f"axis {lacking[0]!r} has no column; where it stood still, state it, as "
-                f"{lacking[0]}: {{constant: 0.0}}"
+                f"no column for {', '.join(lacking)}, which z needs beside it; where one stood "
+                f"still, write {', '.join(f'{axis}: {{constant: 0}}' for axis in lacking)}"
             )
 
     @property

@@ -37,7 +37,8 @@ CAPTIONS = {
     "order": ("Each candidate is a structure that was fitted to the same samples."),
 }
 _CLOSING = (
-    "On a fixed target the probe reads offset + drift − static gain · G_m z, with G_m(0) = 1 and z "
+    "On a fixed target the probe reads offset + drift ∓ static gain · G_m z (− where the distance "
+    "falls when Z rises, + where it rises), with G_m(0) = 1 and z "
     "from the encoder. After ± stands the standard uncertainty, k = 1; bands are 95 %."
 )
 
@@ -208,7 +209,8 @@ def _departures(entries: tables.CertificateEntries) -> Section:
             reading.hidden_table(entries),
         ),
         "Anything larger than the largest size missed, this very test would have shown with a "
-        "probability of 95 %; the band includes what it cannot exclude.",
+        "probability of 95 %; the band carries what it cannot exclude. The rms is that of heights "
+        "on one well-known scan, the paper's mirror at 30 rpm; on yours it is in the scan's report.",
     )
 
 

@@ -112,11 +112,19 @@ def _size(hidden: Mapping[str, Any]) -> str:
     return f"{percent(missed)} of the motion"
 
 
+def _family(entry: Mapping[str, Any]) -> str:
+    """Return a way to depart from linear and steady, with its own time or frequency."""
+    family, parameter = str(entry.get("family", NOTHING)), entry.get("parameter")
+    if family == CREEP:
+        return f"{family} over {quantity(parameter, 's', 2)}"
+    return f"{family} at {quantity(parameter, 'Hz', 2)}" if family == MODE else family
+
+
 def hidden_table(certificate: CertificateEntries) -> Table:
     """Return what this very test would have missed, and what that costs on a scan."""
     rows = [
         (
-            str(entry.get("family", NOTHING)),
+            _family(entry),
             _size(entry),
             quantity(entry.get("missed_effect_on_scan_m"), "m"),
             quantity(entry.get("effect_on_scan_m"), "m"),
@@ -125,7 +133,7 @@ def hidden_table(certificate: CertificateEntries) -> Table:
     ]
     return Table(
         "What could hide",
-        ("largest size missed", "of it on the paper's scan", "in the band"),
+        ("largest size missed", "its rms on the paper's scan", "carried in the band"),
         rows
         + known_rows(
             [

@@ -110,9 +110,10 @@ def test_a_failed_certificate_tells_its_reasons() -> None:
 
 
 def test_a_probe_turned_round_since_is_told() -> None:
-    assert objections(calibration(polarity=1), polarity=-1) == (
-        "polarity is -1, calibrated with 1",
-    )
+    (text,) = objections(calibration(polarity=1), polarity=-1)
+    assert text.startswith("polarity is -1, calibrated with 1 (the distance falls as z rises)")
+    assert text.endswith("state polarity 1 (--polarity 1)")
+    assert "rises as z rises" in objections(calibration(polarity=-1), polarity=1)[0]
 
 
 def test_objections_refuse_unless_overridden_and_are_recorded() -> None:

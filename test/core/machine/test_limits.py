@@ -57,6 +57,17 @@ def test_noise_of_the_encoder_is_no_content() -> None:
     assert content_frequency(1e-3 * SINE + noise, PERIOD) < 20.0
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_the_feed_over_a_round_part_holds_no_frequency_and_its_swing_does(noise):
+    time = np.arange(0, 60, PERIOD)
+    radius = 8e-3 - 25e-6 * time
+    scatter = noise * np.random.default_rng(5).normal(size=len(time))
+    sphere = 0.02 - np.sqrt(0.02**2 - radius**2)
+    assert content_frequency(sphere + scatter, PERIOD) == 0.0
+    toric = radius**2 * (1 + 0.02 * np.cos(4 * np.pi * time))
+    assert content_frequency(toric + scatter, PERIOD) == pytest.approx(2.0, abs=0.1)
+
+
 @pytest.mark.parametrize("servo", [50.0, 200.0])
 @pytest.mark.parametrize("factor", [1.0, 7.0])
 def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: float) -> None:
