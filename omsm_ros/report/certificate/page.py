@@ -210,7 +210,7 @@ def _departures(entries: tables.CertificateEntries) -> Section:
         ),
         "Anything larger than the largest size missed, this very test would have shown with a "
         "probability of 95 %; the band carries what it cannot exclude. The rms is that of heights "
-        "on one well-known scan, the paper's mirror at 30 rpm; on yours it is in the scan's report.",
+        "on one well-known scan, the paper's mirror at 30 rpm; a report has that of its own scan.",
     )
 
 
