@@ -11,8 +11,8 @@ def test_omsm_alone_tells_what_to_do_next(capsys):
     assert cli.main([]) == 0
     told = capsys.readouterr().out
     words = [line.split("omsm ")[1].split()[0] for line in told.splitlines() if "  omsm " in line]
-    first = ["doctor", "demo", "twin", "plan", "inspect", "identify", "predict", "correct", "form"]
-    assert words == first
+    before = ["doctor", "demo", "twin", "plan", "import", "inspect"]
+    assert words == [*before, "identify", "predict", "correct", "form", "batch"]
 
 
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):

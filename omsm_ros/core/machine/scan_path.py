@@ -148,7 +148,7 @@ def _slow_part(velocity: FloatArray) -> FloatArray:
     along = np.linspace(-1.0, 1.0, len(velocity))
     part = np.zeros(len(velocity))
     for degree in range(min(4, len(velocity))):
-        basis = np.polynomial.legendre.Legendre.basis(degree)(along)
+        basis = np.asarray(np.polynomial.legendre.Legendre.basis(degree)(along), np.float64)
         # Nearly orthogonal already; from what is left each time, so that it is so to the last bit.
         part += basis * (basis @ (velocity - part) / (basis @ basis))
     return part
