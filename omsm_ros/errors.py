@@ -86,9 +86,10 @@ _LONGEST_LINE = 1500
 def one_line(text: object) -> str:
     """Return what an error says in one line that has an end: its middle goes, not the remedy.
 
-    Names and words in it come from outside, and may have any length.
+    Names and words in it come from outside: they may have any length, and what would steer a
+    terminal is written out.
     """
-    line = " ".join(str(text).split())
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(str(text).split()))
     half = _LONGEST_LINE // 2
     return line if len(line) <= _LONGEST_LINE else f"{line[:half]} … {line[-half:]}"
 

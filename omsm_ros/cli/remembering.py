@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, table
@@ -13,6 +13,9 @@ from omsm_ros.core.verification.trend import Trend
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.storage.strict_json import unknown_as_null
 from omsm_ros.units import DAY_S
+
+if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
+    from omsm_ros.jobs.keep_history import MachineHistory
 
 _SHOWN_ROWS = 20
 
@@ -40,17 +43,20 @@ def _history(args: argparse.Namespace) -> Facts:
     return {
         "catalogue": address.rpartition("@")[2],
         "added": added,
-        "machines": [_plain(asdict(machine)) for machine in found],
+        "machines": [_plain(machine) for machine in found],
     }
 
 
-def _plain(machine: dict[str, Any]) -> dict[str, Any]:
-    """Return the times as text, for JSON."""
-    for rows in (machine["calibrations"], machine["measurements"]):
+def _plain(machine: MachineHistory) -> dict[str, Any]:
+    """Return a machine for JSON, its times as text."""
+    # Not asdict() of the whole, which would copy every value of every row.
+    facts = {field.name: getattr(machine, field.name) for field in fields(machine)}
+    facts = {name: asdict(part) if is_dataclass(part) else part for name, part in facts.items()}
+    for rows in (machine.calibrations, machine.measurements):
         for row in rows:
             for name in ("recorded_at", "added_at"):
                 row[name] = row[name] and row[name].isoformat(timespec="seconds")
-    plain = unknown_as_null(machine)
+    plain = unknown_as_null(facts)
     assert plain is not None
     return plain
 

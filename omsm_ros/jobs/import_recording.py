@@ -85,8 +85,8 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
     _check_streams(list(chains), mapped)
     streams = [_Stream(chain, mapped) for chain in chains.values()]
     _align(streams, mapped)
-    topics = [bags.AXES_TOPIC] * any("z" in c for c in chains)
-    topics += [bags.DISTANCE_TOPIC] * any("distance" in c for c in chains)
+    topics = [bags.AXES_TOPIC] * any(source.found.axes for source in sources)
+    topics += [bags.DISTANCE_TOPIC] * any(source.found.distance for source in sources)
     done = 0
     with whole_bag(out, topics) as bag:
         # By time, as they would have been recorded, so that no reader has to keep one back.

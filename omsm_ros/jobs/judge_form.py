@@ -23,7 +23,7 @@ from omsm_ros.storage.files import (
     save_json,
 )
 from omsm_ros.storage.maps.vertex_file import write_ply
-from omsm_ros.storage.result_folder import read_result
+from omsm_ros.storage.summary_file import read_summary
 
 # Of the areal density each way: a picture of it, in 70 kB.
 _MOST_BLOCKS = 64
@@ -71,7 +71,7 @@ def draw_form(measured: Path, out: Path) -> None:
 
     folder = measured if measured.is_dir() else measured.parent
     beside = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
-    summary = read_result(beside, "summary") if beside and beside.is_file() else None
+    summary = read_summary(beside) if beside and beside.is_file() else None
     publish_form(out, f"Form of {measured.resolve().name}", summary)
 
 

@@ -11,7 +11,7 @@ from omsm_ros.jobs.correct_bag import MOST_DRAWN
 from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY
-from omsm_ros.storage.result_folder import read_result
+from omsm_ros.storage.summary_file import read_summary
 
 
 def report_again(result: Path, calibration: Calibration, nominal: Surface | None = None) -> Path:
@@ -21,7 +21,7 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
     Raises FileError for a folder that holds no measurement, CalibrationError for another
     calibration than the one it was corrected with.
     """
-    summary = read_result(result / SUMMARY, "summary")
+    summary = read_summary(result / SUMMARY)
     used = summary.get("calibration")
     if used != calibration.id:
         raise CalibrationError(

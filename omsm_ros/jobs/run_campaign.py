@@ -23,11 +23,12 @@ from urllib.parse import urlsplit
 from omsm_ros import __version__
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.quantities import STAMP
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import SUMMARY, read_text, said, save_json
-from omsm_ros.storage.result_folder import read_result
-from omsm_ros.storage.schemas import check_form
+from omsm_ros.storage.schemas import check_form, ranged
+from omsm_ros.storage.summary_file import read_summary
 
 DONE, REFUSED, CRASHED = "done", "refused", "crashed"
 STATE = "campaign.json"
@@ -54,7 +55,7 @@ _STATE_FORM = {
                     "fingerprint": _TEXT,
                     "state": {"enum": [DONE, REFUSED, CRASHED]},
                     "said": _TEXT,
-                    "recorded_ns": {"type": ["integer", "null"]},
+                    "recorded_ns": {**ranged(STAMP), "type": ["integer", "null"]},
                 },
                 "required": ["bag", "folder", "fingerprint", "state", "said"],
             },
@@ -154,7 +155,7 @@ def load_campaign(out: Path) -> list[Entry]:
 
 def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
     """Return the summary of a bag that is done; FileError if it is gone or damaged."""
-    return read_result(out / entry.folder / SUMMARY, "summary")
+    return read_summary(out / entry.folder / SUMMARY)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,14 @@ often it is given. SQLAlchemy is an optional package, loaded where a catalogue i
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from typing import Any
 
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.storage.files import said
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -20,6 +21,7 @@ WAIT_S = 3
 """Longest time that a database may keep a measurement waiting [s]."""
 
 _MOST_ROWS = 100_000
+_STEPS = 100_000  # of SQLite's machine, a millisecond or so
 _SQLITE = "sqlite:///"
 _KINDS = ("sqlite", "postgresql", "postgresql+psycopg")
 
@@ -63,6 +65,8 @@ class Catalogue:
             self._engine = sqlalchemy.create_engine(
                 self.address, connect_args=waiting, poolclass=sqlalchemy.pool.NullPool
             )
+            if sqlite:
+                sqlalchemy.event.listen(self._engine, "connect", _bounded)
             self._make_tables()
         return self
 
@@ -101,7 +105,11 @@ class Catalogue:
         if machine:
             asked = asked.where(source.c.machine == machine)
         with self._translated(), self._engine.connect() as connection:
-            return [dict(row) for row in connection.execute(asked).mappings()]
+            found = [dict(row) for row in connection.execute(asked).mappings()]
+        for column in source.c:
+            name = f"catalogue {self._shown_address()!r}: {column.name} of one of the {table}"
+            _check(name, column.type.python_type, [row[column.name] for row in found])
+        return found
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -111,8 +119,7 @@ class Catalogue:
             raise ConfigurationError(
                 f"catalogue: {said(err)}; pip install psycopg[binary]"
             ) from err
-        except (self._sql.exc.SQLAlchemyError, UnicodeDecodeError) as err:
-            # Of a damaged SQLite file, whose texts may be any bytes, the latter.
+        except Exception as err:  # whatever a library says of a damaged file, or of an address
             raise FileError(
                 f"catalogue {self._shown_address()!r}: {self._reason(err)}; "
                 "check that it is there and may be written"
@@ -126,7 +133,28 @@ class Catalogue:
 
     def _shown_address(self) -> str:
         """Return the address without its password."""
-        return str(self._sql.engine.make_url(self.address).render_as_string(hide_password=True))
+        try:
+            url = self._sql.engine.make_url(self.address)
+        except (ValueError, self._sql.exc.ArgumentError):
+            return self.address.rpartition("@")[2]  # no address, and what may be a password
+        return str(url.render_as_string(hide_password=True))
+
+
+def _check(name: str, kind: type, values: Sequence[object]) -> None:
+    """Raise FileError unless the values are of their column's kind: SQLite keeps any in any."""
+    for value in values:
+        if value is None:
+            continue
+        if kind is float:
+            SIGNAL.checked(value, FileError, name)
+        elif not isinstance(value, kind):
+            raise FileError(f"{name} is {shown(value)}, expected {kind.__name__}; delete that row")
+
+
+def _bounded(connection: Any, _: object) -> None:
+    """Let SQLite give up what does not end: a file may hold a view without an end."""
+    begun = time.monotonic()
+    connection.set_progress_handler(lambda: time.monotonic() - begun > WAIT_S, _STEPS)
 
 
 def time_of(stamp_ns: int | None) -> datetime | None:

@@ -1,7 +1,7 @@
 """The form of a foreign object: its names and types, by JSON schema.
 
-Ranges are not in the schemas: the record that is made of the object holds each quantity against
-the one table.
+Ranges are in the one table of quantities: the record that is made of the object holds each against
+it, or, where none is made, the schema itself does (:func:`ranged`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from omsm_ros.errors import OmsmError
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import Quantity, shown
 
 if TYPE_CHECKING:
     import jsonschema
@@ -28,6 +28,12 @@ def form(properties: Mapping[str, Any], required: Sequence[str]) -> dict[str, An
     }
 
 
+def ranged(quantity: Quantity) -> dict[str, Any]:
+    """Return the schema of a number within the range of ``quantity``, in its unit."""
+    kind = "integer" if quantity.whole else "number"
+    return {"type": kind, "minimum": quantity.low, "maximum": quantity.high}
+
+
 def check_form(
     content: Mapping[str, Any], schema: Mapping[str, Any], error: type[OmsmError], what: str
 ) -> None:
@@ -38,6 +44,12 @@ def check_form(
     found = next(jsonschema.Draft202012Validator(schema).iter_errors(content), None)
     if found is not None:
         raise error(f"{what}: {_said(found)}")
+
+
+_KINDS = {
+    "object": "names and values", "array": "a list", "string": "a text", "number": "a number",
+    "integer": "a whole number", "boolean": "true or false", "null": "null",
+}  # fmt: skip
 
 
 def _said(found: jsonschema.ValidationError) -> str:
@@ -53,8 +65,11 @@ def _said(found: jsonschema.ValidationError) -> str:
             missing = [name for name in wanted if name not in found.instance]  # type: ignore[operator, union-attr]
             return f"{missing[0]} is required and missing; write it there"
         case "type":
-            kind = {"object": "names and values", "array": "a list"}.get(str(wanted), f"a {wanted}")
-            return f"{said}, expected {kind}"
+            kinds = [wanted] if isinstance(wanted, str) else wanted
+            return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}"  # type: ignore[union-attr]
+        case "minimum" | "maximum":
+            low, high = (found.schema[name] for name in ("minimum", "maximum"))  # type: ignore[index, call-overload]
+            return f"{said}, expected {low:g} to {high:g}"
         case "const":
             return f"{said}, expected {wanted!r}"
         case "enum":

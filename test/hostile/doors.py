@@ -12,6 +12,8 @@ from hostile.arguments import SETTINGS, arguments
 from hostile.judge import Case
 from hypothesis import strategies as st
 
+from omsm_ros.storage.files import SUMMARY
+
 Cases = st.SearchStrategy[Callable[[], Case]]
 Strategy = Callable[[Path, Any], Cases]
 
@@ -163,6 +165,7 @@ _ON_RESULTS = [
     ("difference", "result", "bad", "--out", "out"),
     ("export", "bad", "--out", "e.csv"),
     ("history", "--catalogue", "new.sqlite", "--add", "bad"),
+    ("report", "bad", "--calibration", "cal.json"),
 ]
 
 
@@ -185,6 +188,7 @@ def through_results(place: Path, blocks: Any) -> Cases:
                     inputs.damaged(good[name]),
                     maps.renumbered(good[name], 4000),
                     *([maps.repacked(good[name])] if name.endswith(".npz") else []),
+                    *([trees.changed_texts(json.loads(good[name]))] if name == SUMMARY else []),
                 ),
             )
         ),

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile import maps, trees
-from hostile.judge import Case, ask, judge
+from hostile.judge import Case, ask, ask_process, judge
 
 from omsm_ros.errors import FileError
-from omsm_ros.storage.bags import DISTANCE_TOPIC, BagReader
+from omsm_ros.storage.bags import AXES_TOPIC, DISTANCE_TOPIC, BagReader
 from omsm_ros.storage.files import save_text
 
 EXPORT = ("export", "{}", "--unit", "mm", "--out", "e.x3p")
@@ -146,7 +146,46 @@ def test_datasets_that_promise_what_memory_cannot_hold_are_refused(place, count,
     refused(place, EXPORT, "a.h5", (place / "a.h5").read_bytes())
 
 
+@pytest.mark.parametrize("name", ["good.ply", "good.pcd"])
+def test_a_cloud_without_its_last_byte_is_refused(place, name):
+    raw = (place / name).read_bytes()
+    assert "cut short" in refused(place, EXPORT, f"short.{name[-3:]}", raw[:-1])
+
+
 # Tables.
+
+
+def test_complex_numbers_are_none(place):
+    """They would lose their imaginary part without a word."""
+    h5py = pytest.importorskip("h5py", reason="the extra 'formats' is not installed")
+    from scipy.io import savemat
+
+    many = np.arange(800.0)
+    savemat(place / "c.mat", dict.fromkeys("nXZCdi", many) | {"X": many * 1j})
+    assert "imaginary" in refused(place, IMPORT, "c.mat", (place / "c.mat").read_bytes())
+    with h5py.File(place / "c.h5", "w") as content:
+        content.attrs["schema"] = "omsm-points/1"
+        content.update({"x": many, "y": many * 1j, "height": many})
+    assert "complex128" in refused(place, EXPORT, "c.h5", (place / "c.h5").read_bytes())
+
+
+def test_what_a_library_logs_of_a_damaged_file_is_no_line_of_ours(place):
+    tdms = pytest.importorskip("nptdms", reason="the extra 'formats' is not installed")
+    with tdms.TdmsWriter(str(place / "cut.tdms")) as file:
+        file.write_segment([tdms.ChannelObject("g", name, np.zeros(400)) for name in "nXZCdi"])
+    case = Case(
+        tuple(word.replace("{}", "cut.tdms") for word in IMPORT),
+        {"cut.tdms": (place / "cut.tdms").read_bytes()[:-1]},
+    )
+    answer = ask_process(case, place)
+    assert answer.status == 2
+    judge(case, answer, place)
+
+
+def test_what_would_steer_a_terminal_is_written_out(place):
+    said = refused(place, SHOW, "a.yaml", b'"\\e[2J\\u202e": 1\nshape: flat\n')
+    assert "\\x1b[2J" in said
+    assert said.rstrip("\n").isprintable()
 
 
 def test_an_array_without_end_is_refused(place):
@@ -163,6 +202,16 @@ def test_an_archive_of_zeros_is_not_unpacked(place):
         head = array.getvalue()[:-8].replace(b"(1,)", b"(999999999999,)")[:128]
         archive.writestr("t.npy", head + bytes(1000))
     refused(place, IMPORT, "a.npz", out.getvalue())
+
+
+def test_a_slide_that_stood_still_is_an_axis_all_the_same(place):
+    columns = trees.COLUMNS["columns"] | {"z": {"constant": 0, "unit": "m"}}
+    (place / "z.yaml").write_text(json.dumps(trees.COLUMNS | {"columns": columns}))
+    answer = ask(Case(("import", "log.csv", "--map", "z.yaml", "--out", "z.mcap", "--json")), place)
+    assert answer.status == 0, answer
+    with BagReader(place / "z.mcap") as bag:
+        x = np.concatenate([block.x for _, _, block in bag.blocks(AXES_TOPIC)])
+    assert x == pytest.approx(6e-3 - np.arange(len(x)) * 1e-6)
 
 
 def test_a_start_before_1970_is_refused(place):

@@ -1,6 +1,8 @@
 """The page of a finished correction is the one that the correction itself would have written."""
 
+import json
 import re
+import shutil
 from dataclasses import replace
 from itertools import islice
 
@@ -52,3 +54,35 @@ def test_another_calibration_is_refused(shop, true_calibration):
 def test_a_folder_without_a_measurement_is_refused(tmp_path, true_calibration):
     with pytest.raises(FileError, match=r"no summary at .*check the path"):
         report_again(tmp_path, true_calibration)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        (["dynamic_error_before"], 1e-9, "dynamic_error_before is 1e-09, expected names and"),
+        (["deviation", "corrected"], {"rms": 1e-9}, "peak_to_valley is required"),
+        (["light", "level"], "blue", "light.level is 'blue', expected one of"),
+        (["light", "reasons", 0], 100, r"light.reasons[0] is 100, expected names and values"),
+        (["budget", "sources", 0], {"source": "tilt"}, "says is required"),
+        (["prediction", "limits", 0, "speed_factor"], None, "is None, expected a number"),
+        (["samples", "axes", "received"], -1, "samples.axes.received is -1, expected 0 to"),
+        (["samples", "axes", "counted"], {"lost": "many"}, "lost is 'many', expected a whole"),
+        (["conditions", "recorded_ns"], 1e300, "recorded_ns is 1e+300, expected -2.1"),
+        (["uncertainty", "median"], 1e300, "uncertainty.median is 1e+300, expected -1e+100"),
+        (["warnings"], "slow", "warnings is 'slow', expected a list"),
+    ],
+)
+def test_a_summary_that_was_changed_is_refused(shop, tmp_path, capsys, path, value, told):
+    folder = shutil.copytree(shop / "result", tmp_path / "result")
+    summary = json.loads((folder / "summary.json").read_text())
+    place = summary
+    for name in path[:-1]:
+        place = place[name]
+    place[path[-1]] = value
+    (folder / "summary.json").write_text(json.dumps(summary))
+    before = (folder / "report.html").read_bytes()
+    assert cli.main(["report", str(folder), "--calibration", str(shop / "cal.json")]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert told in err
+    assert (folder / "report.html").read_bytes() == before

@@ -290,7 +290,8 @@ def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> Float
     scores = np.add.reduceat(jacobian * residual[:, np.newaxis], edges, axis=0)
     correction = len(scores) / (len(scores) - 1)
     covariance = inverse @ (correction * scores.T @ scores) @ inverse
-    return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
+    with np.errstate(invalid="ignore"):  # what the scan does not show may round below zero
+        return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
 
 
 def _thinned(scan: SphereScan) -> SphereScan:

@@ -26,6 +26,7 @@ from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
+from omsm_ros.errors import DataError
 
 HIGHEST_ORDER = 8
 _TERMS: tuple[Term, ...] = terms_up_to(HIGHEST_ORDER)
@@ -84,7 +85,10 @@ class FormBasis:
 
     @classmethod
     def over(cls, x: FloatArray, y: FloatArray, area: FloatArray, disc: Aperture) -> FormBasis:
-        """Return those of the area that points at x, y [m] stand for, each (n,)."""
+        """Return those of the area that points at x, y [m] stand for, each (n,).
+
+        Raises DataError for points at so few places that no form could show.
+        """
         values = _zernikes(disc, x, y)
         gram = (values * (area / area.sum())) @ values.T
         if np.linalg.cond(gram) < _NEARLY_A_DISC:
@@ -101,6 +105,10 @@ class FormBasis:
                 rows.append(row / np.sqrt(new))
                 groups.append(int(_GROUPS[place]))
         form = np.array(groups) >= 2
+        if not np.any(form):
+            raise DataError(
+                "the points lie at so few places that no form shows in them; scan across the part"
+            )
         return cls(disc, np.array(rows)[form], np.array(groups)[form])
 
     def __len__(self) -> int:

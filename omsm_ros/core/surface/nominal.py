@@ -103,7 +103,9 @@ class OffAxisParaboloid:
         q2 = 1 + slope**2
         b = 2 * slope / q2 * np.asarray(x) + 4 * self.parent_focal_length * np.sqrt(q2)
         c = np.square(x) / q2 + np.square(y)
-        return b, c, np.sqrt(b**2 - 4 * slope**2 / q2 * c), slope
+        with np.errstate(invalid="ignore"):  # beyond the rim there is no surface
+            root = np.sqrt(b**2 - 4 * slope**2 / q2 * c)
+        return b, c, root, slope
 
 
 PAPER_MIRROR = OffAxisParaboloid(parent_focal_length=25.4e-3, off_axis_distance=50.8e-3)

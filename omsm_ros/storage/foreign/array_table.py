@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,9 @@ class ArrayTable(ForeignTable):
         with open_regular(self.path, FileError, "table") as stream:
             if stream.read(10) == b"MATLAB 7.3":  # which is HDF5 under another name
                 return self._hdf5()
-        loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
+        with warnings.catch_warnings():  # complex numbers would lose a part without a word
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)
+            loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
         return loaded
 
     def _hdf5(self) -> Mapping[str, Any]:

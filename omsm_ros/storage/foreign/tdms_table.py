@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,8 +27,11 @@ class TdmsTable(ForeignTable):
         super().__init__(path)
         try:
             from nptdms import TdmsFile
+            from nptdms.log import log_manager
         except ImportError as err:
             raise FileError(f"{self} needs npTDMS; pip install npTDMS, or give CSV") from err
+        # What it would print of a damaged file is told here, in one line.
+        log_manager.set_level(logging.CRITICAL)
         with ExitStack() as opening:
             stream = opening.enter_context(open_regular(path, FileError, "table"))
             try:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.quantities import MAP_POINTS
+from omsm_ros.quantities import MAP_POINTS, shown
 from omsm_ros.storage.files import open_regular, said, whole_file
 from omsm_ros.storage.hdf5_walk import walked
 from omsm_ros.storage.maps.length_units import metres_in
@@ -65,6 +65,8 @@ def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
     shape = getattr(dataset, "shape", ())
     if len(shape) != axes:
         raise FileError(f"{what} holds an array of shape {shape!r}, expected {axes} of them")
+    if dataset.dtype.kind not in "fiu":
+        raise FileError(f"{what} holds an array of {shown(str(dataset.dtype))}, expected numbers")
     MAP_POINTS.checked(math.prod(shape), FileError, f"{what}: number of points")
     return np.asarray(dataset[()])
 

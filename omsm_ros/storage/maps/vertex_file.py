@@ -131,8 +131,9 @@ def _records(
     begin = stream.tell()
     held = stream.seek(0, io.SEEK_END) - begin
     stream.seek(begin)
-    least = 2 * len(dtype) * count if ascii_text else dtype.itemsize * count
-    if held < least - 1:
+    # The last line of a text need not end.
+    least = 2 * len(dtype) * count - 1 if ascii_text else dtype.itemsize * count
+    if held < least:
         raise FileError(
             f"{what} says that it has {count} points and holds {held} bytes of them; it was cut "
             "short, write it again"

@@ -1,0 +1,58 @@
+"""A catalogue that somebody changed by hand is told in one line, and never believed."""
+
+import sqlite3
+
+import pytest
+
+pytest.importorskip("sqlalchemy", reason="the extra 'catalogue' is not installed")
+
+from omsm_ros.errors import FileError
+from omsm_ros.jobs.keep_history import history, keep_calibration
+from omsm_ros.storage.catalogue import Catalogue
+
+
+@pytest.fixture
+def address(tmp_path, true_calibration):
+    found = str(tmp_path / "catalogue.sqlite")
+    keep_calibration(found, true_calibration, tmp_path / "cal.json")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("recorded_at = 'yesterday'", "yesterday"),
+        ("added_at = '2026-13-45'", "month must be in 1..12"),
+        ("static_gain = 'x'", "static_gain of one of the calibrations is 'x', expected a number"),
+        ("delay = 9e999", "delay of one of the calibrations is inf"),
+        ("delay = x'00ff'", r"delay of one of the calibrations is b'\x00\xff'"),
+        ("machine = x'ff'", r"machine of one of the calibrations is b'\xff', expected str"),
+    ],
+)
+def test_a_row_that_cannot_be_is_named(address, change, told):
+    with sqlite3.connect(address) as base:
+        base.execute(f"UPDATE calibrations SET {change}")
+    with pytest.raises(FileError, match=r"catalogue .*catalogue.sqlite") as refusal:
+        history(address)
+    assert told in str(refusal.value)
+
+
+def test_a_view_without_end_is_given_up(address, monkeypatch):
+    monkeypatch.setattr("omsm_ros.storage.catalogue.WAIT_S", 0.2)
+    with sqlite3.connect(address) as base:
+        columns = [row[1] for row in base.execute("PRAGMA table_info(calibrations)")]
+        base.execute("DROP TABLE calibrations")
+        base.execute(
+            "CREATE VIEW calibrations AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL "
+            f"SELECT i + 1 FROM n) SELECT i AS id, {', '.join(f'NULL AS {c}' for c in columns[1:])}"
+            " FROM n"
+        )
+    with pytest.raises(FileError, match="interrupted"):
+        history(address)
+
+
+@pytest.mark.parametrize("address", ["a\0b", "postgresql://u:secret@[::1", "sqlite:///a%00\0b"])
+def test_an_address_that_is_none_is_named_without_its_password(address):
+    with pytest.raises(FileError, match="check that it is there") as refusal, Catalogue(address):
+        pass
+    assert "secret" not in str(refusal.value)
