@@ -212,4 +212,5 @@ class _Gathered:
             # The sources' effects stand behind those of the pose.
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
             moves=found.moves,
+            taken=found.taken,
         )

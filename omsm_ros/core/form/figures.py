@@ -32,6 +32,9 @@ class DeviationMap:
         deviations (e, n) [m]
     bounds: which of the effects are upper bounds of errors that may not be there at all
     moves: which of them are of a part that sits elsewhere, in the first order
+    taken: the first t effects are of form that the fit may have taken for a move: it is missing
+        from the deviations, not added to them. Mean products of how much of each is likely to be
+        missing (t, t), at most one
     noise: standard deviation of one point [m]
     """
 
@@ -43,6 +46,7 @@ class DeviationMap:
     noise: float
     bounds: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     moves: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    taken: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -56,6 +60,7 @@ class DeviationMap:
             noise=self.noise,
             bounds=self.bounds,
             moves=self.moves,
+            taken=self.taken,
         )
 
 

@@ -1,7 +1,8 @@
-"""Where on the part do its terms lie, if no points tell how it was turned or shifted along itself?
+"""Where on the part do its terms lie, if points tell badly how it was turned or shifted?
 
 A sphere may be moved along itself, and its form goes along: terms in the frame that was found are
-those of the part in its own only as far as such a move changes them.
+those of the part in its own only as far as such a move changes them. The same holds for a part
+whose pose is known to tenths of a millimetre.
 """
 
 from __future__ import annotations
@@ -20,22 +21,24 @@ _MOST_POINTS = 4_000
 
 
 def with_open_place(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
-    """Return the fit with what each freedom that no points determine may do to its terms.
+    """Return the fit with what the open place of the part may do to its terms.
 
-    In the first order: the slope of the smooth form times how far its places would move.
+    Of each freedom that no points determine, and of each error of the pose beside what that does
+    to the deviations. In the first order: the slope of the smooth form times how far its places
+    would move.
     """
-    if not found.dragged:
-        return fit
     few = map_.every(_MOST_POINTS)
-    along_x, along_y = (
-        fit.coefficients @ slopes / fit.disc.radius
-        for slopes in zernike_slopes(*fit.disc.scaled(few.x, few.y), fit.terms)
+    slopes = (
+        fit.coefficients @ along / fit.disc.radius
+        for along in zernike_slopes(*fit.disc.scaled(few.x, few.y), fit.terms)
     )
-    moves = found.glides(few.x, few.y)
-    changes = -(moves[:, 0] * along_x + moves[:, 1] * along_y)
+    moves = np.concatenate([found.displaced(few.x, few.y), found.glides(few.x, few.y)])
+    changes = -np.einsum("rin,in->rn", moves, np.stack(list(slopes)))
     made = fit_zernikes(
         few.x, few.y, few.deviation, fit.terms, fit.disc, weights=few.area, effects=changes
     )
     if made.terms != fit.terms:
         return fit
-    return replace(fit, effects=np.concatenate([fit.effects, made.effects], axis=1))
+    effects = made.effects
+    effects[:, : fit.effects.shape[1]] += fit.effects
+    return replace(fit, effects=effects)

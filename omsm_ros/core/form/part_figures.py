@@ -11,6 +11,11 @@ all there is. So with F of the deviations and F' of the deviations with errors d
 point to point is first averaged out by smooth terms; of what they leave, the share that is no noise
 stays.
 
+What the fit of the pose may have taken away is no error that was added: form that looks like a move
+is missing from the deviations. Their form and it are independent of each other (the estimate and
+its error, in a fit that knows how large form is), so that its mean square is added, as far as it
+is likely; that there may be more is uncertainty of the figure.
+
 An upper bound is no error that is there: how large an open latency is, nobody knows. It is not
 subtracted. By how much an error of its size would change the square, as mean square about none, is
 uncertainty of the figure.
@@ -47,14 +52,16 @@ def rms_of_part(map_: DeviationMap) -> Figure:
     products = weighted @ map_.effects.T
     shared = weighted @ map_.deviation
     noise = map_.noise**2
-    real = _real(map_)
-    among_real = products[np.ix_(real, real)]
-    square = float(share @ map_.deviation**2 - np.trace(among_real) - noise)
+    real, taken = _real(map_), slice(len(map_.taken))
+    among_real, own = products[np.ix_(real, real)], np.diag(products)
+    missing = float(np.sum(map_.taken * products[taken, taken]))
+    square = float(share @ map_.deviation**2 - np.trace(among_real) - noise) + missing
     of_form = 4 * max(float(np.sum(shared[real] ** 2)) - float(np.sum(among_real**2)), 0.0)
+    of_form += 4 * float(np.sum(shared[taken] ** 2)) + (float(np.sum(own[taken])) - missing) ** 2
     # With e = Σ a_i f_i that may be there, 2 d·e − e·e has the mean square 4 Σ (d·f_i)² + tr² P +
     # 2 tr P², P the products of the f_i.
-    bounded = float(np.trace(products) - np.trace(among_real))
-    of_bounds = 4 * float(np.sum(shared[~real] ** 2)) + bounded**2
+    bounded = float(np.sum(own[map_.bounds]))
+    of_bounds = 4 * float(np.sum(shared[map_.bounds] ** 2)) + bounded**2
     of_errors = of_form + of_bounds + 2 * float(np.sum(products**2))
     variance = of_errors + _variance_by_noise(map_, share)
     return _of_square(square, float(np.sqrt(variance)))
@@ -68,7 +75,8 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     few = map_.every(_MOST_FITTED)
     fit = _smooth(few, disc)
     base = _without_noise(few, fit)
-    drawn, bounded, chosen = _drawn(few, fit, base)
+    chosen = slice(None, None, -(-len(few) // _MOST_DRAWN))
+    ways = _drawn(few, fit, base, chosen)
     area = few.area[chosen]
 
     def robust(deviations: FloatArray, area: FloatArray) -> FloatArray:
@@ -82,9 +90,11 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     for extent in (whole, robust):
         of_all = float(extent(base[:, np.newaxis], few.area)[0])
         of_some = float(extent(base[chosen][:, np.newaxis], area)[0])
-        again, more = extent(drawn, area) ** 2, extent(bounded, area) ** 2
-        square = 2 * of_some**2 - float(np.mean(again))
-        figure = _of_square(square, float(np.hypot(np.std(again), _rms(more - again))))
+        again, more, likely, full = (extent(drawn, area) ** 2 for drawn in ways)
+        square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
+        of_taken = _rms(full - np.mean(likely))
+        spread = _length(float(np.std(again)), _rms(more - again), of_taken)
+        figure = _of_square(square, spread)
         found.append(Figure((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
 
@@ -107,29 +117,42 @@ def _without_noise(map_: DeviationMap, fit: ZernikeFit) -> FloatArray:
 
 
 def _drawn(
-    map_: DeviationMap, fit: ZernikeFit, base: FloatArray
-) -> tuple[FloatArray, FloatArray, slice]:
-    """Return some of the deviations with errors drawn anew (m, draws), and which they are.
+    map_: DeviationMap, fit: ZernikeFit, base: FloatArray, chosen: slice
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return some of the deviations with errors drawn anew (m, draws).
 
-    The second has also what may be there of the upper bounds.
+    The second has besides what may be there of the upper bounds. The others have, instead of
+    errors, what the fit is likely to have taken away, and what it may have.
     """
-    chosen = slice(None, None, -(-len(map_) // _MOST_DRAWN))
     random = np.random.default_rng(_SEED)
-    values, vectors = np.linalg.eigh(fit.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
     terms = zernike_values(*fit.disc.scaled(map_.x[chosen], map_.y[chosen]), fit.terms)
-    real, effects = _real(map_), map_.effects[:, chosen]
-    ways = np.concatenate([effects[real], root.T @ terms])
-    drawn = base[chosen][:, np.newaxis] + ways.T @ random.normal(size=(len(ways), _DRAWS))
-    bounds = effects[~real]
-    return drawn, drawn + bounds.T @ random.normal(size=(len(bounds), _DRAWS)), chosen
+    effects, still = map_.effects[:, chosen], base[chosen][:, np.newaxis]
+    taken = effects[: len(map_.taken)]
+
+    def anew(ways: FloatArray) -> FloatArray:
+        return np.asarray(ways.T @ random.normal(size=(len(ways), _DRAWS)), np.float64)
+
+    drawn = still + anew(np.concatenate([effects[_real(map_)], _root(fit.covariance) @ terms]))
+    bounded = drawn + anew(effects[map_.bounds])
+    return drawn, bounded, still + anew(_root(map_.taken) @ taken), still + anew(taken)
+
+
+def _root(products: FloatArray) -> FloatArray:
+    """Return rows (k, k) whose outer products add up to these mean ``products`` (k, k)."""
+    values, vectors = np.linalg.eigh(products)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T, np.float64)
 
 
 def _real(map_: DeviationMap) -> BoolArray:
     """Return which effects (e,) are of errors that are there, whatever their sign."""
     real = np.ones(len(map_.effects), np.bool_)
     real[map_.bounds] = False
+    real[: len(map_.taken)] = False
     return real
+
+
+def _length(*shares: float) -> float:
+    return float(np.sqrt(sum(share**2 for share in shares)))
 
 
 def _rms(values: FloatArray) -> float:

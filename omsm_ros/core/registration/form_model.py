@@ -6,9 +6,10 @@ squares would call all of it shift, and state a hundredth of its error. Here the
 
     d = J δ + Z c + noise,   c_k ~ N(0, σ_g²)
 
-J the freedoms of the fit, without bounds, and Z polynomials of orders 2 to 8, whose sizes
-σ_g, one for each order, are found from the data themselves by restricted maximum likelihood
-(D. MacKay, Neural Comput. 4, 415; the fixed point of its eq. 4.9). Form falls with order: no order
+J the freedoms of the fit, within what a part may be off by that was put on by hand, and Z
+polynomials of orders 2 to 8, whose sizes σ_g, one for each order, are found from the data
+themselves by restricted maximum likelihood (D. MacKay, Neural Comput. 4, 415; the fixed point of
+its eq. 4.9). Form falls with order: no order
 may have less than a higher one, and a size found from few terms may be that of a lucky part: it is
 taken as large as six of seven parts would have it. So a shift is read off those orders in which
 this part is good, and its uncertainty holds what the others may have. Dust is what lies far from
@@ -160,7 +161,7 @@ class NormalEquations:
 
 class Estimate(NamedTuple):
     """step: δ (p,) in the unit of the columns;  form: c (k,) [m rms];  covariance: of both
-    sizes: σ_g of each term (k,) [m]
+    sizes: σ_g of each term (k,) [m];  likely: covariance of the step where no size is bad luck
     """
 
     step: FloatArray
@@ -168,6 +169,7 @@ class Estimate(NamedTuple):
     covariance: FloatArray
     sizes: FloatArray
     noise: float
+    likely: FloatArray
 
     @property
     def length(self) -> float:
@@ -181,7 +183,12 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    gram: FloatArray, moments: FloatArray, variance: float, largest: float, group: IntArray
+    gram: FloatArray,
+    moments: FloatArray,
+    variance: float,
+    largest: float,
+    group: IntArray,
+    expected: tuple[FloatArray, FloatArray],
 ) -> Estimate:
     """Return the estimate from the normal equations of columns [J, Z].
 
@@ -189,6 +196,7 @@ def estimate(
     variance: of the noise of one point, as it averages out [m²]
     largest: mean square of the data [m²], which bounds what form there may be
     group: of each column of Z (k,): its order, or that of rings
+    expected: where the freedoms stand, and standard deviation of where parts do, about zero (p,)
     """
     freedoms = len(gram) - len(group)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
@@ -196,6 +204,9 @@ def estimate(
     points = float(np.median(np.diag(gram)[freedoms:]))
     noise = max(variance, _LEAST_M**2, points * _BEST_KNOWN_M**2)
     normal, right = gram / np.outer(scale, scale) / noise, moments / scale / noise
+    value, spread = expected[0] * scale[:freedoms], expected[1] * scale[:freedoms]
+    normal[np.arange(freedoms), np.arange(freedoms)] += 1 / spread**2
+    right[:freedoms] -= value / spread**2
     least = np.maximum(_LEAST_SHARE / np.diag(normal)[freedoms:], _LEAST_M**2)
     sizes = np.maximum(largest, least)
     for _ in range(_TURNS):
@@ -208,6 +219,7 @@ def estimate(
         sizes = new
         if change < _SETTLED:
             break
+    likely = covariance[:freedoms, :freedoms]
     sizes = sizes * _unlucky(np.diag(covariance)[freedoms:] / sizes, group)
     covariance = _inverse(normal, sizes, freedoms)
     found = covariance @ right / scale
@@ -217,6 +229,7 @@ def estimate(
         covariance=covariance / np.outer(scale, scale),
         sizes=np.sqrt(sizes),
         noise=noise,
+        likely=likely / np.outer(scale, scale)[:freedoms, :freedoms],
     )
 
 

@@ -23,9 +23,8 @@ HELD = "freedoms held"
 RIGID = FREEDOMS[:6]
 MOVES = ("x", "y", "clocking")
 """Freedoms that a chuck settles; piston, tip and tilt no part comes without."""
-# Of its uncertainty: a part that is found so far off was moved. Less may be its form, the size of
-# which is itself found from few terms.
-_PLAINLY = 5.0
+# Odds that a part was moved, at which it is said to be: strong evidence. Less may be its form.
+_PLAINLY = 20.0
 _LEAST_FORM_M = NANOMETRE_M
 
 
@@ -99,7 +98,9 @@ def weakest(
 ) -> tuple[str, str] | None:
     """Return which move had better be held at its nominal value, and why; None if none had.
 
-    One that takes away no more form than its uncertainty leaves open says nothing of the part.
+    One that takes away hardly more form than its uncertainty leaves open says nothing of the part:
+    the odds that it moved, against one that sits as it should, are the density of its place at
+    zero before the fit over that after it (J. Dickey, Ann. Math. Stat. 42, 204).
 
     values: of ``names`` (p,) as they were found;  covariance: of these (p, p)
     gram: mean products of what they do to the deviation (p, p)
@@ -110,11 +111,11 @@ def weakest(
     # The part of its column that no other freedom has.
     own = scale / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     found = [
-        (abs(values[k]) / spread[k], k)
+        ((values[k] / spread[k]) ** 2 / 2 - np.log(widest(name) / spread[k]), k)
         for k, name in enumerate(names)
         if name in MOVES and own[k] * spread[k] > _LEAST_FORM_M
     ]
-    if not found or min(found)[0] > _PLAINLY:
+    if not found or min(found)[0] > np.log(_PLAINLY):
         return None
     k = min(found)[1]
     unit = "rad" if names[k] == "clocking" else "m"

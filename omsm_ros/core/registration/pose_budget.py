@@ -29,7 +29,8 @@ class Registration:
     surface: the nominal;  placement: of the part;  freedoms: what was fitted, and what could not be
     from_source: standard uncertainty of each (p,) by where it comes from
     pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
-    held_effects: the same of those that are held (h, h), as far as the points bound them
+    taken: mean products of how much of each form is likely to have made (p, p), at most one
+    held_effects: steps of those that are held (h, h), as far as the points bound them
     moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
         then by how much what is held does (p, s + 2h)
     spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
@@ -45,6 +46,7 @@ class Registration:
     freedoms: Freedoms
     from_source: dict[str, FloatArray]
     pose_effects: FloatArray
+    taken: FloatArray
     held_effects: FloatArray
     moved: FloatArray
     spread: dict[str, float]
@@ -78,16 +80,35 @@ class Registration:
         For each of r freedoms that no points determine, off by as much as it may be; the others
         follow, and the points stay on the surface.
         """
+        fitted = self.freedoms.fitted
+        steps = [
+            [widest(name), *(others[n][0] for n in fitted)] for name, others in self.dragged.items()
+        ]
+        ways = [
+            self._moved((n, *fitted), s, x, y) for n, s in zip(self.dragged, steps, strict=True)
+        ]
+        return np.array(ways).reshape(-1, 2, len(x))
+
+    def displaced(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the same (e, 2, n) [m] for each row of :meth:`effects`, one below the other."""
+        fitted, held = self.freedoms.fitted, tuple(self.freedoms.held)
+        own = np.zeros((len(self.pose_effects) + self.moved.shape[1], len(fitted) + len(held)))
+        own[:, : len(fitted)] = np.concatenate([self.pose_effects, self.moved.T])
+        # Of what is held, the second order moves no place.
+        first = len(own) - 2 * len(held)
+        own[first::2, len(fitted) :] = self.held_effects
+        return np.array([self._moved((*fitted, *held), step, x, y) for step in own])
+
+    def _moved(
+        self, names: Sequence[str], step: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray
+    ) -> FloatArray:
+        """Return where places x, y of the part come to lie by a step of its freedoms (2, n) [m]."""
         pose = self.placement.pose
         places = np.stack([x, y, np.nan_to_num(self.surface.height(x, y))])
         there = pose.rotation @ places + pose.origin[:, np.newaxis]
-        found = np.empty((len(self.dragged), 2, len(x)))
-        for row, (name, others) in enumerate(self.dragged.items()):
-            step = np.array([widest(name), *(others[n][0] for n in self.freedoms.fitted)])
-            moved = self.placement.moved((name, *self.freedoms.fitted), step).pose
-            back = moved.rotation.T @ (there - moved.origin[:, np.newaxis])
-            found[row] = (back - places)[:2]
-        return found
+        moved = self.placement.moved(names, np.asarray(step)).pose
+        back = moved.rotation.T @ (there - moved.origin[:, np.newaxis])
+        return np.asarray((back - places)[:2])
 
     @property
     def moves(self) -> IntArray:
@@ -176,3 +197,10 @@ def root_of(covariance: FloatArray) -> FloatArray:
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray((np.sqrt(np.maximum(values, 0.0)) * vectors).T * scale, np.float64)
+
+
+def shares_of(rows: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return mean products (p, p) of amounts of ``rows`` (p, p) that make up the covariance."""
+    scale = np.linalg.norm(rows, axis=0)
+    amounts = np.linalg.pinv((rows / scale).T, rcond=1e-9)
+    return np.asarray(amounts @ (covariance / np.outer(scale, scale)) @ amounts.T, np.float64)

@@ -15,6 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.registration.coarse_placement import (
+    LEAST_POINTS,
+    SHARE_OF_SPREAD,
+    coarse_placement,
+)
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
     Estimate,
@@ -38,7 +43,13 @@ from omsm_ros.core.registration.placement import (
     selection,
     usable,
 )
-from omsm_ros.core.registration.pose_budget import Open, Registration, effects_of_held, root_of
+from omsm_ros.core.registration.pose_budget import (
+    Open,
+    Registration,
+    effects_of_held,
+    root_of,
+    shares_of,
+)
 from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.area_weights import area_weights
@@ -47,16 +58,12 @@ from omsm_ros.errors import DataError
 
 # Points at a time: 7 freedoms and 42 polynomials of each are 6 MB.
 CHUNK = 16_384
-# Four points for each of these columns are the least.
-_MOST_SELECTED, _LEAST_POINTS = 40_000, 200
-# Both together took 12 to 36 on spheres and off-axis paraboloids that had form.
-_MOST_TURNS, _MOST_REFINED = 30, 30
+_MOST_SELECTED, _MOST_REFINED = 40_000, 30
 # Points without errors, for seven unknowns.
 _ENOUGH_FOR_A_CURVE = 2000
-# A pose stands when its last step moved no point by more than this share of their spread.
-_SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
-# Or by this share of what is unknown of it: where form and pose look alike, the sizes of form that
-# are found go to and fro by a thousandth, and the pose with them by twentieths of its uncertainty.
+# A pose stands too when its last step moved it by this share of what is unknown of it: where form
+# and pose look alike, the sizes of form that are found go to and fro by a thousandth, and the pose
+# with them by twentieths of its uncertainty.
 _SHARE_OF_UNCERTAINTY = 0.1
 
 
@@ -81,23 +88,23 @@ def register(
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
     first = usable(placed(surface, start, chosen), aperture)
-    if len(first.x) < _LEAST_POINTS:
+    if len(first.x) < LEAST_POINTS:
         raise DataError(
-            f"{len(first.x)} points lie on the nominal surface, expected {_LEAST_POINTS} or more; "
+            f"{len(first.x)} points lie on the nominal surface, expected {LEAST_POINTS} or more; "
             "check its parameters, the aperture and the units of the cloud"
         )
     freedoms = _determined(surface, chosen, asked, aperture, start)
     try:
-        at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
+        at = coarse_placement(surface, chosen, freedoms.fitted, aperture, start)
     except DataError:
         # Where the part was left askew, a turn of half a degree may pass for one that shows.
-        seated = _coarse(surface, chosen, FREEDOMS[:3], aperture, start)
+        seated = coarse_placement(surface, chosen, FREEDOMS[:3], aperture, start)
         freedoms = _determined(surface, chosen, asked, aperture, seated)
-        at = _coarse(surface, chosen, freedoms.fitted, aperture, start)
+        at = coarse_placement(surface, chosen, freedoms.fitted, aperture, start)
     points = usable(placed(surface, at, chosen), aperture)
     disc = aperture or about_the_origin(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
-    fit = _Fit(surface, freedoms, aperture, basis)
+    fit = _Fit(surface, freedoms, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = Open.of(fit.unknown(stand.at, chosen))
     if AUTO in asked:
@@ -149,52 +156,26 @@ def _useful(
             break
         fit = replace(fit, freedoms=fit.freedoms.without(*weak))
         back = stand.at.moved([weak[0]], np.array([-stand.at.value(weak[0])]))
-        stand = fit.refine(_coarse(fit.surface, chosen, fit.names, fit.aperture, back), chosen)
+        stand = fit.refine(
+            coarse_placement(fit.surface, chosen, fit.names, fit.aperture, back), chosen
+        )
     held = [names.index(n) for n in fit.freedoms.held]
     square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
     return fit, stand, open_._replace(held=square)
 
 
-def _coarse(
-    surface: Surface,
-    chosen: Portion,
-    names: Sequence[str],
-    aperture: Aperture | None,
-    at: Placement,
-) -> Placement:
-    """Return the placement of least squares, points far from the others left out."""
-    for turn in range(_MOST_TURNS):
-        points = usable(placed(surface, at, chosen), aperture)
-        if turn and len(points.x):
-            middle = points.deviation - np.median(points.deviation)
-            # Generous: what is left here is still the pose.
-            points = points.part(np.abs(middle) <= max(8 * scatter.spread(middle), LEAST_LIMIT_M))
-        if len(points.x) < _LEAST_POINTS:
-            break
-        columns = -freedom_columns(at, points, names)
-        scale = np.sqrt(np.mean(columns**2, axis=1))
-        step = np.linalg.lstsq((columns / scale[:, np.newaxis]).T, points.deviation, rcond=1e-12)
-        at = at.moved(names, step[0] / scale)
-        # The refinement that follows converges from far more.
-        settled = max(_SHARE_OF_SPREAD * scatter.spread(points.deviation), _SETTLED_M)
-        # Of all freedoms together: what x does a tilt may undo.
-        moved = float(np.sqrt(np.mean((step[0] @ (columns / scale[:, np.newaxis])) ** 2)))
-        if turn > 1 and moved < settled:
-            return at
-    raise DataError(
-        "the points do not settle on the nominal surface; check its parameters, the sign of its "
-        "radii and the units of the cloud, or fit fewer freedoms"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What stays the same over the passes."""
+    """What stays the same over the passes.
+
+    plain: the placement of least squares
+    """
 
     surface: Surface
     freedoms: Freedoms
     aperture: Aperture | None
     basis: FormBasis
+    plain: Placement
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -218,7 +199,9 @@ class _Fit:
         found: dict[str, dict[str, FloatArray]] = {}
         for name in self.freedoms.refused:
             ends = [
-                _coarse(self.surface, few, self.names, None, rigid.moved([name], np.array([off])))
+                coarse_placement(
+                    self.surface, few, self.names, None, rigid.moved([name], np.array([off]))
+                )
                 for off in (widest(name), -widest(name))
             ]
             found[name] = {}
@@ -252,7 +235,7 @@ class _Fit:
             near = np.abs(residual) <= limit
             sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
 
-    def solved(self, sums: NormalEquations) -> tuple[Estimate, float]:
+    def solved(self, at: Placement, sums: NormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
         free = len(self.names)
         variance = sums.square / max(sums.points - sums.columns, 1)
@@ -261,8 +244,18 @@ class _Fit:
         together = float(np.mean(sums.scores[free:] / own)) / variance if variance > 0 else 1.0
         square = sums.gram[:, : sums.columns]
         moments, largest = sums.gram[:, sums.columns], sums.total / max(sums.points, 1)
-        found = estimate(square, moments, variance * max(together, 1.0), largest, self.basis.group)
+        noise, expected = variance * max(together, 1.0), self.expected(at)
+        found = estimate(square, moments, noise, largest, self.basis.group, expected)
         return found, variance
+
+    def expected(self, at: Placement) -> tuple[FloatArray, FloatArray]:
+        """Return where the freedoms stand and how far a part may be off in them, both (p,).
+
+        One that lies plainly further off than a part that was put on by hand was moved so.
+        """
+        first = [abs(self.plain.value(n)) for n in self.names]
+        value = np.array([at.value(n) for n in self.names])
+        return value, np.maximum([widest(n) for n in self.names], first)
 
     def refine(self, at: Placement, chosen: Portion) -> _Stand:
         """Return the placement that stands.
@@ -280,10 +273,10 @@ class _Fit:
             none = np.empty((0, int(near.sum())))
             sums = self.new_sums(0)
             sums.add(columns[:, near], points.deviation[near], none, residual[near])
-            found, _ = self.solved(sums)
+            found, _ = self.solved(at, sums)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             step = found.step * own
-            settled = max(_SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
+            settled = max(SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
             # Of all freedoms together: what x does a tilt may undo.
             gram = sums.gram[: len(step), : len(step)]
             square = float(found.step @ gram @ found.step) / sums.points
@@ -312,7 +305,7 @@ def _over_all(
         before = placed(fit.surface, Placement(), portion).deviation
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))
-    found, variance = fit.solved(sums)
+    found, variance = fit.solved(stand.at, sums)
     gain = found.covariance[:free] / found.noise
     # A source that is off by its standard uncertainty moves the pose by one of these columns.
     moved = gain @ sums.gram[:, sums.columns + 1 :]
@@ -324,6 +317,7 @@ def _over_all(
         freedoms=fit.freedoms,
         from_source=by_source,
         pose_effects=root_of(covariance),
+        taken=shares_of(root_of(covariance), found.likely),
         held_effects=held,
         moved=moved,
         spread=open_.spread(fit.freedoms, by_source),

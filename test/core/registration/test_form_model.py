@@ -22,7 +22,7 @@ def test_a_step_is_measured_in_its_own_uncertainty():
     covariance = np.zeros((5, 5))
     covariance[:3, :3] = mixed @ mixed.T
     step = mixed @ np.array([2.0, -1.0, 2.0])
-    made = Estimate(step, np.zeros(2), covariance, np.zeros(2), 1.0)
+    made = Estimate(step, np.zeros(2), covariance, np.zeros(2), 1.0, covariance)
     assert made.length == pytest.approx(3.0, rel=1e-6)
 
 
