@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
     from omsm_ros.jobs.keep_history import MachineHistory
 
 _SHOWN_ROWS = 20
+_NO_NAME = """(no machine named; identify and correct with --settings '{"machine": "…"}')"""
 
 
 def _declare_history(sub: argparse.ArgumentParser) -> None:
@@ -43,6 +44,7 @@ def _history(args: argparse.Namespace) -> Facts:
     return {
         "catalogue": address.rpartition("@")[2],
         "added": added,
+        **({"figure": str(args.plot)} if args.plot is not None else {}),
         "machines": [_plain(machine) for machine in found],
     }
 
@@ -65,16 +67,16 @@ def _show_history(facts: Facts) -> None:
     if not facts["machines"]:
         print(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
     for machine in facts["machines"]:
-        print(machine["machine"] or "(machine not named in the settings)")
+        print(machine["machine"] or _NO_NAME)
         for row in machine["calibrations"][-_SHOWN_ROWS:]:
             print(
-                f"  {row['recorded_at'] or row['added_at']}  calibration {row['id'][:8]}  "
+                f"  {_when(row)}  calibration {row['id'][:8]}  "
                 f"lag {measured(row['delay'], row['delay_uncertainty'], 's')}  "
                 f"gain {plain(row['static_gain'], 6)}  {row['verdict']}"
             )
         for row in machine["measurements"][-_SHOWN_ROWS:]:
             print(
-                f"  {row['recorded_at'] or row['added_at']}  {Path(row['bag']).name}  "
+                f"  {_when(row)}  {Path(row['bag']).name}  "
                 f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
             )
         table(
@@ -85,6 +87,13 @@ def _show_history(facts: Facts) -> None:
                 ("  form's rms drifts a day", _drift(machine["deviation"], "m")),
             ]
         )
+    if "figure" in facts:
+        print(f"written: {facts['figure']}")
+
+
+def _when(row: dict[str, Any]) -> str:
+    """Return when a row was recorded; where its recording has no date, when it was written down."""
+    return f"{row['recorded_at']} UTC" if row["recorded_at"] else f"added {row['added_at']} UTC"
 
 
 def _counts(machine: dict[str, Any]) -> str:

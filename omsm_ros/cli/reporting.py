@@ -13,7 +13,9 @@ from omsm_ros.storage.surface_file import load_surface
 def _declare_report(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="DIR", help="that 'omsm correct' wrote")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
+    sub.add_argument(
+        "--nominal", type=Path, metavar="SURFACE.yaml", help="as it was corrected with"
+    )
 
 
 def _report(args: argparse.Namespace) -> Facts:

@@ -26,6 +26,7 @@ from omsm_ros.core.samples.foreign_columns import (
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.jobs.foreign_rows import Origin, RowCounter
 from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.quantities import shown
 from omsm_ros.storage import bags
 from omsm_ros.storage.foreign.open_tables import open_tables
 from omsm_ros.storage.foreign.table import ForeignTable, TableForm, stated_unit
@@ -82,7 +83,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
     chains: dict[tuple[str, ...], list[_Source]] = {}
     for source in sources:
         chains.setdefault(source.channels, []).append(source)
-    _check_streams(list(chains), mapped)
+    _check_streams(sources, list(chains), mapped)
     streams = [_Stream(chain, mapped) for chain in chains.values()]
     _align(streams, mapped)
     topics = [bags.AXES_TOPIC] * any(source.found.axes for source in sources)
@@ -100,17 +101,20 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
             progress(done, 0)
 
 
-def _check_streams(chains: list[tuple[str, ...]], mapped: ColumnMap) -> None:
+def _check_streams(
+    sources: Sequence[_Source], chains: list[tuple[str, ...]], mapped: ColumnMap
+) -> None:
     """Raise FileError unless each stream is whole and comes from files of one kind."""
     for channel in mapped.columns:
         if not mapped.has(channel) or channel in COUNTING:
             continue
-        holders = [c for c in chains if channel in c]
-        if len(holders) != 1:
-            found = "no file has" if not holders else "files with different columns have"
+        holders, name = [c for c in chains if channel in c], mapped.columns[channel].name
+        if not holders:
+            raise FileError("; ".join(source.without(name, channel) for source in sources))
+        if len(holders) > 1:
             raise FileError(
-                f"{found} the column {mapped.columns[channel].name!r} of {channel}; "
-                "name it as the file's line of names does, in one kind of file"
+                f"files with different columns have the column {name!r} of {channel}; import them "
+                "one by one, or leave out those that only repeat it"
             )
 
 
@@ -176,6 +180,18 @@ class _Source:
             )
         self._check_units()
         self._check_period()
+
+    def without(self, name: str, channel: str) -> str:
+        """Return why the column ``name`` of ``channel`` is not to be had here."""
+        if often := self._table.names.count(name):
+            return (
+                f"{self._table} has {often} columns {name!r}, one of which is {channel}; "
+                "rename the others"
+            )
+        return (
+            f"{self._table} has no column {name!r} of {channel}, but {shown(self._table.names)}; "
+            "name it as the file does"
+        )
 
     def _check_period(self) -> None:
         stated, mapped = self._table.sample_period, self._mapped.sample_period

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.errors import CalibrationError
+from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.jobs.correct_bag import MOST_DRAWN
 from omsm_ros.jobs.publish import figures_of, map_of, publish, view_of
 from omsm_ros.storage.cloud_file import CloudFile
@@ -19,7 +19,8 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
 
     Nothing is computed anew: every figure comes from the summary there, every map from its cloud.
     Raises FileError for a folder that holds no measurement, CalibrationError for another
-    calibration than the one it was corrected with.
+    calibration than the one it was corrected with, ConfigurationError where it had a nominal
+    surface and none is given.
     """
     summary = read_summary(result / SUMMARY)
     used = summary.get("calibration")
@@ -27,6 +28,11 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
         raise CalibrationError(
             f"{str(result)!r} was corrected with calibration {str(used)[:12]!r}, given is "
             f"{calibration.id[:12]!r}; give the one that it was corrected with"
+        )
+    if nominal is None and "deviation" in summary:
+        raise ConfigurationError(
+            f"{str(result)!r} was corrected with a nominal surface, from which its figures "
+            "deviate; give it (--nominal)"
         )
     view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), calibration.sample_period)
     figures = figures_of(view, calibration, nominal, calibration.sample_period)

@@ -17,6 +17,7 @@ from omsm_ros.quantities import shown
 from omsm_ros.storage.strict_json import bounded_integer, finite_float
 
 MAX_DEPTH = 8
+_LINES = "write 'name: value' lines, and quotes around a text with any of [ ] { } , : #"
 _Number = TypeVar("_Number")
 
 
@@ -93,7 +94,7 @@ def mapping_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:
         finally:
             loader.dispose()
     except (yaml.YAMLError, RecursionError, ValueError) as err:
-        raise error(f"{what} is not plain YAML: {_said(err)}; write 'name: value' lines") from err
+        raise error(f"{what} is not plain YAML: {_said(err)}; {_LINES}") from err
     if not isinstance(content, dict):
         raise error(f"{what} holds {shown(content)}, expected 'name: value' lines")
     return content

@@ -224,6 +224,29 @@ def test_a_unit_that_the_file_contradicts_is_refused(read, name):
     assert read(f"{name}\n1\n2\n", stated) == pytest.approx([1, 2])
 
 
+@pytest.mark.parametrize("unit", ["mm", "[mm]", " (mm) ", '"mm"'])
+def test_a_line_of_units_that_contradicts_the_map_is_refused(read, unit):
+    text = f"i,d\n-,{unit}\n0,1\n1,2\n"
+    assert "'d' in mm, the map in um" in refusal(read, text, PROBE + "lines_after_names: 1\n")
+    words = f"i,d\nrunning,number of\n-,{unit}\n0,1\n1,2\n"
+    assert "'d' in mm, the map in um" in refusal(read, words, PROBE + "lines_after_names: 2\n")
+    fits = text.replace("mm", "um")
+    assert read(fits, PROBE + "lines_after_names: 1\n") == pytest.approx([1, 2])
+
+
+def test_a_column_that_is_not_there_or_stands_twice_is_told_by_the_names_of_the_file(read):
+    mapping = PROBE + "  intensity: {name: p, unit: '1'}\n"
+    missing = refusal(read, "p,D\n0,1\n1,2\n", mapping)
+    assert "no column 'd' of distance, but ['p', 'D']" in missing
+    twice = refusal(read, "d,p,d\n1,0,1\n2,1,2\n", mapping)
+    assert "2 columns 'd', one of which is distance; rename the others" in twice
+
+
+def test_a_name_that_yaml_reads_otherwise_wants_quotes(read):
+    mapping = PROBE.replace("name: d", "name: d [um]")
+    assert "quotes around a text with any of [ ]" in refusal(read, "d [um]\n1\n2\n", mapping)
+
+
 def test_side_by_side_by_time_though_one_begins_later(importer):
     """Rows belong together by time, not by their places."""
     time = np.arange(0, 1, 0.001)

@@ -10,7 +10,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.errors import CalibrationError, FileError
+from omsm_ros.errors import CalibrationError, ConfigurationError, FileError
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.record_twin import write_nominal
 from omsm_ros.jobs.report_again import report_again
@@ -49,6 +49,11 @@ def test_another_calibration_is_refused(shop, true_calibration):
     other = replace(true_calibration, settings={"machine": "another"})
     with pytest.raises(CalibrationError, match="give the one that it was corrected with"):
         report_again(shop / "result", other)
+
+
+def test_deviations_are_not_drawn_as_heights(shop, true_calibration):
+    with pytest.raises(ConfigurationError, match=r"nominal surface.*--nominal"):
+        report_again(shop / "result", true_calibration)
 
 
 def test_a_folder_without_a_measurement_is_refused(tmp_path, true_calibration):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.foreign_columns import UNITS
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import shown
 from omsm_ros.storage.files import open_regular
@@ -33,6 +34,7 @@ _NO_TEXT = {
     b"\x89HDF": "it is HDF5; name it .h5",
     b"\x89MCA": "it is a ROS bag; name it .mcap",
 }
+_UNITS = frozenset().union(*UNITS.values())
 _DELIMITERS = (";", "\t", ",", "|")
 # 1 234, 1'234 or 1,234.5, of which 1,234 alone may be a decimal comma; spaces may be narrow.
 _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)?|.*,.*\\..*")
@@ -61,6 +63,8 @@ class TextTable(ForeignTable):
         body = [line for line in lines[self._first_row :] if line.strip()]
         self._first_cells = self._cells(body[0]) if body else []
         self.names = head if form.named else [f"[{i}]" for i in range(len(head))]
+        for line in reversed(lines[place + 1 : self._first_row] if form.named else []):
+            self.units.update(self._stated_units(line))
 
     def hint(self, names: Sequence[str]) -> str:
         """Return where the line of names may be, or how its cells may be separated."""
@@ -120,6 +124,11 @@ class TextTable(ForeignTable):
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
         return [cell.strip().strip('"') for cell in cells]
+
+    def _stated_units(self, line: str) -> dict[str, str]:
+        """Return the units that a line below the names holds, as mm, [mm] or (mm)."""
+        cells = [cell.strip().strip("[]()").strip() for cell in self._named_cells(line)]
+        return {n: unit for n, unit in zip(self.names, cells, strict=False) if unit in _UNITS}
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]

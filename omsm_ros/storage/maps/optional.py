@@ -14,5 +14,5 @@ def library(name: str, what: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as err:
         raise FileError(
-            f"{what} needs a further Python package: pip install {name}, or convert the file to xyz"
+            f"{what} needs a further Python package: pip install {name}, or use xyz or PLY instead"
         ) from err
