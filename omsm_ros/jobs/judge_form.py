@@ -112,8 +112,14 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
             "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},
             "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",
         },
-        "points": form.counts,
+        "points": _counts(form, measured.missing),
     }
+
+
+def _counts(form: Form, missing: int) -> dict[str, int]:
+    """Return every point by what became of it, and those that never had a height."""
+    added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
+    return form.counts | added
 
 
 def _advice(form: Form) -> list[str]:

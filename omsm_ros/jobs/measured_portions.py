@@ -13,7 +13,7 @@ from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import Aperture, Portion, Portions
 from omsm_ros.core.surface.height_grid import as_grid
-from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.core.surface.measured_points import MeasuredPoints, each_once
 from omsm_ros.errors import FileError
 from omsm_ros.storage.cloud_file import CloudFile
 from omsm_ros.storage.fields_file import load_fields
@@ -32,6 +32,7 @@ class Measurement:
     notes: what a reader of the results should know about how the file was understood
     even: whether the points are those of an evenly spaced grid
     bounds: names of the sources of which only an upper bound is known
+    missing: how many points of a map, beside these, have no height
     """
 
     portions: Portions
@@ -40,6 +41,7 @@ class Measurement:
     notes: tuple[str, ...] = ()
     even: bool = False
     bounds: tuple[str, ...] = ()
+    missing: int = 0
 
     def form(
         self,
@@ -75,9 +77,11 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     try:
         cloud = CloudFile(file)
     except FileError:
-        points = read_points(file, units)
+        points = each_once(read_points(file, units))
         gridded = as_grid(points) is not None
-        return Measurement(lambda: _slices(points), (), False, points.notes, gridded)
+        return Measurement(
+            lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
+        )
     notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None

@@ -288,7 +288,8 @@ class _Fit:
             share, last = relaxed(share, last, step), step
             at = at.moved(self.names, share * found.step)
         raise DataError(
-            "the pose does not settle: on these points it and the part's form look alike; hold "
+            "the pose does not settle: on these points it and the part's form look alike; check "
+            "the surface's parameters, the sign of its radii and the units of the cloud, or hold "
             "what need not be fitted, as --fit piston,tip,tilt"
         )
 

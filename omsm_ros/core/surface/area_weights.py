@@ -72,7 +72,9 @@ def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, Float
 def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
     """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
     steps = np.abs(np.diff(angle))
-    steps = np.minimum(steps, min(_MOST_STEPS * float(np.median(steps)), _LARGEST_ARC))
+    # Where the path rests, or a point is told again, there is no step.
+    usual = float(np.median(steps[steps > 0]))
+    steps = np.minimum(steps, min(_MOST_STEPS * usual, _LARGEST_ARC))
     covered = np.empty(len(angle))
     covered[0], covered[-1] = steps[0], steps[-1]
     covered[1:-1] = (steps[1:] + steps[:-1]) / 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, POSITION, UNCERTAINTY
+
+# Odd, of bits without a pattern: 2⁶⁴ over the golden ratio.
+_MIXED = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -75,15 +78,34 @@ def measured(
     *,
     sample: NDArray[Any] | None = None,
 ) -> MeasuredPoints:
-    """Return the points (n,) [m] whose height is a number; those that have none are counted."""
-    known = np.isfinite(height)
+    """Return the points (n,) [m] with a place and a height; those that have none are counted."""
+    x, y, height = (np.ascontiguousarray(v, np.float64) for v in (x, y, height))
+    known = np.isfinite(height) & ~np.isnan(x) & ~np.isnan(y)
     order = None if sample is None else COUNTER.checked_all(sample[known], DataError, "sample")
     return MeasuredPoints(
-        x=np.ascontiguousarray(x[known], np.float64),
-        y=np.ascontiguousarray(y[known], np.float64),
-        height=np.ascontiguousarray(height[known], np.float64),
+        x=x[known],
+        y=y[known],
+        height=height[known],
         uncertainty=None if uncertainty is None else np.asarray(uncertainty[known], np.float64),
         sample=None if order is None else order.astype(np.int64),
         missing=int(np.sum(~known)),
         notes=notes,
     )
+
+
+def each_once(points: MeasuredPoints) -> MeasuredPoints:
+    """Return the points without those that stand there again in every digit; a note tells them.
+
+    What a program has written twice is no second measurement.
+    """
+    # A product of all bits of a point in 64: of 20 million points two are taken for one by chance
+    # in one file of 100 000.
+    number = np.zeros(len(points), np.uint64)
+    for values in (points.x, points.y, points.height):
+        number = (number ^ values.view(np.uint64)) * _MIXED
+        number ^= number >> np.uint64(32)
+    _, first = np.unique(number, return_index=True)
+    if len(first) == len(points):
+        return points
+    note = f"{len(points) - len(first)} points stand there again in every digit: left out"
+    return replace(points.part(np.sort(first)), notes=(*points.notes, note))

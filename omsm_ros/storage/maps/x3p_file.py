@@ -5,7 +5,9 @@ Written in the revision ``ISO5436 - 2000``, which every reader takes.
 
 from __future__ import annotations
 
+import re
 import zipfile
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,15 @@ from omsm_ros.storage.maps.optional import library
 # All points that are read, in eight bytes each, and what describes them.
 MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
 
+_REVISION = re.compile(rb"<(?:[\w.-]+:)?Revision>([^<]*)<")
+# Letters and digits of a revision, and its text in the standard.
+_REVISIONS = {
+    b"iso54362000": b"ISO5436 - 2000",
+    b"iso25178722017": b"ISO5436 - 2000",
+    b"iso25178722017dam1": b"ISO25178-72:2017/DAM1",
+    b"iso25178722017amd12020": b"ISO25178-72:2017/DAM1",
+}
+
 # Types of heights that an increment makes lengths of.
 _WHOLE = ("I", "L")
 
@@ -37,13 +48,14 @@ def read_x3p(path: Path) -> MeasuredPoints:
         try:
             with zipfile.ZipFile(stream) as archive:
                 size = sum(member.file_size for member in archive.infolist())
-            if size > MAX_UNPACKED_BYTES:
-                raise FileError(
-                    f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
-                    "thin it"
-                )
+                if size > MAX_UNPACKED_BYTES:
+                    raise FileError(
+                        f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
+                        "thin it"
+                    )
+                known = _with_known_revision(archive)
             stream.seek(0)
-            content = x3pio.read(stream)
+            content = x3pio.read(known or stream)
             place = _places(x3pio, content)
         except FileError:
             raise
@@ -52,6 +64,30 @@ def read_x3p(path: Path) -> MeasuredPoints:
     layers = len(content.layers)
     notes = (f"the first of its {layers} layers",) if layers > 1 else ()
     return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
+
+
+def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
+    """Return the archive with the spelling of its revision that x3pio knows; None if it has it.
+
+    The standards fix the text, and programs write their own: ISO5436_2000, ISO25178-72:2017.
+    """
+    main = archive.read("main.xml")
+    found = _REVISION.search(main)
+    bare = re.sub(rb"[^a-z0-9]", b"", found[1].lower()) if found else b""
+    if found is None or bare not in _REVISIONS or found[1].strip() == _REVISIONS[bare]:
+        return None
+    spelled = BytesIO()
+    with zipfile.ZipFile(spelled, "w") as made:
+        for member in archive.infolist():
+            # What it says of main.xml no longer holds.
+            if member.filename.endswith("md5checksum.hex"):
+                continue
+            content = archive.read(member)
+            if member.filename == "main.xml":
+                content = main[: found.start(1)] + _REVISIONS[bare] + main[found.end(1) :]
+            made.writestr(member.filename, content)
+    spelled.seek(0)
+    return spelled
 
 
 def _places(x3pio: Any, content: Any) -> FloatArray:

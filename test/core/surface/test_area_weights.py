@@ -144,3 +144,18 @@ def test_turns_are_those_about_the_origin() -> None:
     assert turns(*spiral()) == pytest.approx(127, abs=0.01)
     x, y = spiral()
     assert turns(x + 0.1, y) < 1
+
+
+def test_points_told_again_or_a_rest_take_no_area_from_the_others():
+    x, y = spiral(9000, 30.0)
+    once = area_weights(x, y)
+    thrice = area_weights(np.repeat(x, 3), np.repeat(y, 3))
+    # The ends of the path have a step on one side only.
+    together = thrice.reshape(-1, 3).mean(axis=1)[1:-1]
+    np.testing.assert_allclose(together, once[1:-1], rtol=2e-2, atol=1e-2)
+    rested = area_weights(
+        np.append(x, np.full(20_000, x[-1])), np.append(y, np.full(20_000, y[-1]))
+    )
+    share = rested[:9000] / rested[:9000].mean()
+    assert np.all(np.isfinite(rested))
+    np.testing.assert_allclose(share[:8000], once[:8000], rtol=2e-2)
