@@ -69,10 +69,10 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
     if shape == _GRID:
         surface = _grid(values, f"{what}: {shape}", folder or Path())
     else:
-        surface = _record(SHAPES[shape], values, f"{what}: {shape}")
+        surface = _record(SHAPES[shape], values, f"{what}: {shape}", folder)
     if pose is None:
         return surface
-    return PosedSurface(surface, _value(Pose, pose, f"{what}: pose"))
+    return PosedSurface(surface, _value(Pose, pose, f"{what}: pose", folder))
 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
@@ -93,14 +93,14 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
         raise SurfaceError(f"{what}: {err}") from err
 
 
-def _record(kind: Any, values: Mapping[str, Any], what: str) -> Any:
+def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None) -> Any:
     """Return a record of ``kind`` made of ``values`` under the names of its fields."""
     known = [each for each in fields(kind) if each.init]
     hints = get_type_hints(kind)
     required = [each.name for each in known if each.default is MISSING]
     schema = form({each.name: _schema(hints[each.name]) for each in known}, required)
     check_form(values, schema, SurfaceError, what)
-    made = {n: _value(hints[n], v, f"{what}: {n}") for n, v in values.items()}
+    made = {n: _value(hints[n], v, f"{what}: {n}", folder) for n, v in values.items()}
     try:
         return kind(**made)
     except (ConfigurationError, SurfaceError) as err:
@@ -116,13 +116,14 @@ def _schema(hint: Any) -> Mapping[str, Any]:
     return {int: _INTEGER, float: NUMBER}.get(_present(hint), {})
 
 
-def _value(hint: Any, value: Any, what: str) -> Any:
+def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
     """Return the foreign ``value`` as one of the type ``hint``."""
     if value is None and _present(hint) is not hint:
         return None
     kind = _present(hint)
     if get_origin(kind) is tuple:
-        return tuple(_value(get_args(kind)[0], v, f"{what}[{k}]") for k, v in enumerate(value))
+        each = get_args(kind)[0]
+        return tuple(_value(each, v, f"{what}[{k}]", folder) for k, v in enumerate(value))
     if kind is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise SurfaceError(f"{what} is {shown(value)}, expected a number")
@@ -130,7 +131,9 @@ def _value(hint: Any, value: Any, what: str) -> Any:
     if kind is Surface or is_dataclass(kind):
         if not isinstance(value, dict):
             raise SurfaceError(f"{what} is {shown(value)}, expected names and values")
-        return surface_of(value, what) if kind is Surface else _record(kind, value, what)
+        if kind is Surface:
+            return surface_of(value, what, folder)
+        return _record(kind, value, what, folder)
     return value
 
 

@@ -94,6 +94,25 @@ def test_a_map_is_a_surface(tmp_path):
     assert np.isnan(surface.height(np.array([0.02]), np.zeros(1)))
 
 
+def test_a_map_may_be_part_of_a_sum_or_parent_of_a_section(tmp_path):
+    """What a surface has beyond its formula is often known as a map alone."""
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(-8, 8, 81), np.linspace(-6, 6, 61)))
+    wave = 1e-3 * np.cos(0.3 * x) * np.sin(0.2 * y)
+    np.savetxt(tmp_path / "map.xyz", np.column_stack([x, y, wave]), fmt="%.15g")
+    path = tmp_path / "surface.yaml"
+    map_ = "{shape: grid, file: map.xyz, unit: mm}"
+    path.write_text(f"shape: sum\nparts:\n- {{shape: sphere, radius: 0.1}}\n- {map_}\n")
+    at_x, at_y = np.array([1.23e-3, -4.5e-3]), np.array([2.34e-3, 3.3e-3])
+    expected = 1e-6 * np.cos(300 * at_x) * np.sin(200 * at_y)
+    expected += 0.1 - np.sqrt(0.01 - at_x**2 - at_y**2)
+    np.testing.assert_allclose(load_surface(path).height(at_x, at_y), expected, atol=1e-11)
+    path.write_text(f"shape: off_axis_section\ndistance: 1.0e-3\nparent: {map_}\n")
+    assert np.isfinite(load_surface(path).height(at_x, at_y)).all()
+    path.write_text("shape: sum\nparts:\n- {shape: grid, file: map.xyz}\n")
+    with pytest.raises(SurfaceError, match=r"parts\[0\]: grid: .*unit"):
+        load_surface(path)
+
+
 def test_a_hole_in_a_map_is_a_hole_in_the_surface():
     line = np.linspace(-1.0, 1.0, 21)
     height = np.add.outer(line**2, line)
@@ -112,7 +131,7 @@ def test_a_hole_in_a_map_is_a_hole_in_the_surface():
         ("shape: grid\nfile: none.xyz\n", "none.xyz"),
         ("shape: grid\nfile: points.xyz\nunit: mm\n", "no evenly spaced rows"),
         ("shape: grid\nfile: points.xyz\nunit: cubit\n", "cubit"),
-        ("shape: sum\nparts: [{shape: grid, file: a}]\n", "grid.*expected one of"),
+        ("shape: sum\nparts: [{shape: grid, file: a}]\n", r"parts\[0\]: grid: "),
     ],
 )
 def test_what_is_no_map_is_refused(text, named, tmp_path):
