@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, table
 from omsm_ros.core.verification.trend import Trend
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.storage.strict_json import unknown_as_null
 from omsm_ros.units import DAY_S
@@ -18,6 +19,7 @@ if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
     from omsm_ros.jobs.keep_history import MachineHistory
 
 _SHOWN_ROWS = 20
+_USUAL = "catalogue.sqlite"
 _NO_NAME = """(no machine named; identify and correct with --settings '{"machine": "…"}')"""
 
 
@@ -33,7 +35,12 @@ def _declare_history(sub: argparse.ArgumentParser) -> None:
 def _history(args: argparse.Namespace) -> Facts:
     from omsm_ros.jobs.keep_history import history, keep
 
-    address = args.catalogue or "catalogue.sqlite"
+    address = args.catalogue or _USUAL
+    if not args.catalogue and not args.add and not Path(_USUAL).exists():
+        raise ConfigurationError(
+            f"no catalogue is named, and there is no {_USUAL!r} here; give --catalogue, set "
+            "OMSM_CATALOGUE, or begin one with --add"
+        )
     added = sum(keep(address, path) for path in args.add)
     found = history(address, args.machine)
     if args.plot is not None:

@@ -22,7 +22,8 @@ class StreamInspection:
     """What a stream of blocks holds.
 
     gaps: places where the trigger counter skips; missing: samples skipped there
-    restarts: places where it falls back;  invalid: readings that are none
+    restarts: places where it falls back
+    invalid: readings of the probe, or places of the axes, that are none
     """
 
     topic: str

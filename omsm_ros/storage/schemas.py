@@ -68,7 +68,9 @@ def _said(found: jsonschema.ValidationError) -> str:
             kinds = [wanted] if isinstance(wanted, str) else wanted
             return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}"  # type: ignore[union-attr]
         case "minimum" | "maximum":
-            low, high = (found.schema[name] for name in ("minimum", "maximum"))  # type: ignore[index, call-overload]
+            low, high = (found.schema.get(name) for name in ("minimum", "maximum"))  # type: ignore[union-attr]
+            if low is None or high is None:
+                return f"{said}, expected at {'most' if low is None else 'least'} {wanted:g}"
             return f"{said}, expected {low:g} to {high:g}"
         case "const":
             return f"{said}, expected {wanted!r}"

@@ -209,3 +209,11 @@ def test_history_is_listed_drawn_and_told_as_json(capsys, tmp_path, address, tru
     assert cli.main(["history", "--catalogue", address, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["machines"][0]["machine"] == "lathe 1"
+
+
+def test_a_question_begins_no_catalogue(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("OMSM_CATALOGUE", raising=False)
+    assert cli.main(["history"]) == 2
+    assert "set OMSM_CATALOGUE, or begin one with --add" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import SAME_PERIOD, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
@@ -26,7 +26,7 @@ class StreamWatch:
 
     missing: trigger counts left out;  gaps: the first places, each (first, last) of what is missing
     places, restarts, repeated: gaps in all, times that the count began anew, samples seen twice
-    invalid, samples: readings that are none, of all
+    invalid, samples: readings of the probe, or places of the axes, that are none, of all
     """
 
     def __init__(self) -> None:
@@ -56,6 +56,9 @@ class StreamWatch:
             self._marks[arrival.session].append((block.first_sample, block.stamp_ns))
         if isinstance(block, DistanceBlock):
             self.invalid += int(np.sum(~block.ok))
+        elif isinstance(block, AxisBlock):
+            axes = np.array([block.x, block.y, block.z, block.b, block.c])
+            self.invalid += int(np.sum(~np.all(np.isfinite(axes), axis=0)))
 
     def marks(self, since_ns: int) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield counts, and stamps after ``since_ns`` [s], of the blocks of each session."""

@@ -102,3 +102,10 @@ def test_one_block_each_and_none_in_common() -> None:
     assert counter_skew(watched(axes(0)), watched(distance(0, counter=5))) == pytest.approx(5e-3)
     assert counter_skew(watched(axes(0)), StreamWatch()) is None
     assert list(skew_fault(None, PERIOD)) == []
+
+
+def test_places_where_an_axis_was_lost_are_counted_once_each() -> None:
+    block = axes(0)
+    z, c = block.z.copy(), block.c.copy()
+    z[[3, 7]], c[[7, 50]] = np.nan, np.nan
+    assert watched(replace(block, z=z, c=c), axes(100)).invalid == 3
