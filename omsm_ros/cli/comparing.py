@@ -119,6 +119,8 @@ def _show_difference(facts: Facts) -> None:
         rows.append((label, f"{words}: {_length(n['a'])} and {_length(n['b'])}"))
     if facts["within"] is not None:
         rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
+    for name in ("a", "b"):
+        rows += [(f"note on {name.upper()}", text) for text in facts[name]["notes"]]
     table([*rows, ("written", ", ".join(facts["files"].values()))])
 
 

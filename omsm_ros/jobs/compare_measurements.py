@@ -25,6 +25,7 @@ from omsm_ros.core.comparison.stated_errors import Measurement
 from omsm_ros.core.correction.scan_fields import ScanFields
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.surface.deviation import deviation
+from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.jobs.registered_points import registered
 from omsm_ros.readable import moment
@@ -76,7 +77,7 @@ def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | No
     Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
     """
     units = options.units and replace(options.units, where_unsaid=True)
-    points = read_points(path, units)
+    points = _in_order(read_points(path, units), options.drift)
     if nominal is not None and options.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)
@@ -91,6 +92,25 @@ def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | No
     if nominal is None or options.register is None:
         return measured
     return registered(measured, nominal, options.register)
+
+
+def _in_order(points: MeasuredPoints, drift: float | None) -> MeasuredPoints:
+    """Return the points with the order of their scan, where somebody says that they ``drift``.
+
+    Scattered points of another program stand in the order in which they were measured; what is
+    sorted, as a map, has none.
+    """
+    if points.sample is not None or as_grid(points) is not None:
+        return points
+    if drift:
+        note = "its points carry no numbers: their order in the file is taken for that of the scan"
+        sample = np.arange(len(points), dtype=np.int64)
+        return replace(points, sample=sample, notes=(*points.notes, note))
+    note = (
+        "its points carry no numbers, so that its drift is taken for form; if they stand in the "
+        "order of the scan, state the drift, as --drift 20e-9"
+    )
+    return replace(points, notes=(*points.notes, note)) if drift is None else points
 
 
 def _calibration_of(path: Path) -> str:
