@@ -210,8 +210,8 @@ class TextTable(ForeignTable):
         if self._form.decimal == "," and "." in line:
             return "numbers with a decimal comma have no points; write thousands without them"
         return (
-            "write numbers there, leave it empty where there is no reading, list the text that means "
-            "so (as invalid: ['---']), or delete a line that is no row"
+            "write numbers there, leave it empty where there is no reading, list the text that "
+            "means so (as invalid: ['---']), or delete a line that is no row"
         )
 
     @property
