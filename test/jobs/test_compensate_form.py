@@ -56,9 +56,23 @@ def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, tmp_path, capsys
     assert np.std(before) > 5 * ripple
     assert np.std(after) == pytest.approx(ripple, rel=0.35)
     assert load_surface(folder / "mirror.yaml") == PAPER_MIRROR
-    # The noise of each cell is in what it expects to be left; before, squares of the terms add up.
+    # The ripple, and what the filter leaves of the form at the rim; before, squares add up.
     assert ripple < facts["rms_after"] < 7e-9
     assert facts["rms_before"] == pytest.approx(33e-9, rel=0.1)
+
+
+def test_what_will_be_left_holds_marks_finer_than_the_table(tmp_path, capsys):
+    """Tool marks of a quarter of a cell of the table: no cut takes them away."""
+    r, angle = RADIUS * (1 - np.arange(40_000) / 40_000), np.arange(40_000) * 0.03
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    marks = 20e-9 * np.cos(2 * np.pi * r / 2.4e-4)
+    noise = np.random.default_rng(3).normal(0, 5e-9, len(x))
+    height = r**2 / 0.2 + 60e-9 * (x**2 - y**2) / RADIUS**2 + marks + noise
+    np.savetxt(tmp_path / "part.xyz", np.stack([x, y, height], axis=1), fmt="%.15g")
+    (tmp_path / "mirror.yaml").write_text("shape: asphere\nradius: 0.1\nconic_constant: -1\n")
+    assert compensate(tmp_path, tmp_path / "out", "--low-pass", "0.004", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["rms_after"] == pytest.approx(20e-9 / np.sqrt(2), rel=0.1)
 
 
 def test_the_stated_uncertainty_is_that_of_the_offsets(folder, tmp_path):

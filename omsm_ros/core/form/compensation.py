@@ -7,14 +7,14 @@ texture, or faster than the axes, and stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omsm_ros.core.form.cells import Cells
 from omsm_ros.core.form.figures import DeviationMap
 from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.slopes import gradient_of
 from omsm_ros.errors import DataError
 
@@ -29,7 +29,8 @@ class Compensation:
     x, y: of the columns and rows [m];  offset: to be added to the height that is cut, along z [m],
         (r, c), NaN where nothing was measured;  uncertainty: of each, k = 1 [m]
     low_pass: wavelength of which half is compensated [m]
-    before, after: rms of the cells' deviation now, and less what is compensated [m]
+    before, after: rms of the deviation now, and less what is compensated; of what the points show,
+        however fine, without their noise [m]
     """
 
     x: FloatArray
@@ -39,6 +40,23 @@ class Compensation:
     low_pass: float
     before: float
     after: float
+
+    def between(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the offsets [m] at x, y (n,) [m], linear between cells; NaN beside all of them."""
+        column, row = ((v - g[0]) / (g[1] - g[0]) for v, g in ((x, self.x), (y, self.y)))
+        total, weight = np.zeros(len(x)), np.zeros(len(x))
+        for right in (0, 1):
+            for above in (0, 1):
+                c, r = np.floor(column).astype(int) + right, np.floor(row).astype(int) + above
+                inside = (c >= 0) & (c < len(self.x)) & (r >= 0) & (r < len(self.y))
+                value = np.full(len(x), np.nan)
+                value[inside] = self.offset[r[inside], c[inside]]
+                near = np.where(
+                    np.isfinite(value), (1 - np.abs(column - c)) * (1 - np.abs(row - r)), 0.0
+                )
+                total += near * np.nan_to_num(value)
+                weight += near
+        return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), np.nan)
 
 
 def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compensation:
@@ -57,16 +75,29 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
     averaged = np.sqrt(cells.smoothed_square(cells.noise**2, low_pass))
     spread = np.sqrt(averaged**2 + np.sum(smooth[1:] ** 2, axis=0))
     x, y = np.meshgrid(cells.x, cells.y)
-    slope_x, slope_y = gradient_of(surface, x, y)
-    along_z = np.where(cells.present, np.sqrt(1 + slope_x**2 + slope_y**2), np.nan)
-    here = cells.mean[cells.present]
-    rest = here - smooth[0][cells.present]
-    return Compensation(
+    along_z = np.where(cells.present, _along_z(surface, x, y), np.nan)
+    found = Compensation(
         x=cells.x,
         y=cells.y,
         offset=np.asarray(-smooth[0] * along_z),
         uncertainty=np.asarray(spread * along_z),
         low_pass=low_pass,
-        before=float(np.sqrt(np.mean(here**2))),
-        after=float(np.sqrt(np.mean(rest**2))),
+        before=0.0,
+        after=0.0,
     )
+    cut = found.between(map_.x, map_.y) / _along_z(surface, map_.x, map_.y)
+    there = np.isfinite(cut)
+    before = _rms(map_, map_.deviation, there)
+    return replace(found, before=before, after=_rms(map_, map_.deviation + cut, there))
+
+
+def _along_z(surface: Surface, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return how far along z a unit along the normal is, at x, y, of their shape."""
+    slopes = np.asarray(gradient_of(surface, x, y), np.float64)
+    return np.asarray(np.sqrt(1 + np.sum(slopes**2, axis=0)), np.float64)
+
+
+def _rms(map_: DeviationMap, deviation: FloatArray, there: BoolArray) -> float:
+    """Return the rms by area of the points that are ``there`` (n,), without their noise [m]."""
+    square = np.average(deviation[there] ** 2, weights=map_.area[there])
+    return float(np.sqrt(max(float(square) - map_.noise**2, 0.0)))

@@ -53,27 +53,9 @@ def spiral_offsets(found: Compensation, feed: float, per_turn: int) -> ToolPath:
         )
     turned = np.arange(int(places) + 1) / per_turn
     radius, angle = rim - feed * turned, 2 * np.pi * turned
-    offset = _between(found, radius * np.cos(angle), -radius * np.sin(angle))
+    offset = found.between(radius * np.cos(angle), -radius * np.sin(angle))
     there = np.isfinite(offset)
     return ToolPath(radius[there], angle[there], offset[there], int(np.sum(~there)))
-
-
-def _between(found: Compensation, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the offsets at x, y (n,), linear between the cells that have one; NaN beside them."""
-    column, row = ((v - g[0]) / (g[1] - g[0]) for v, g in ((x, found.x), (y, found.y)))
-    total, weight = np.zeros(len(x)), np.zeros(len(x))
-    for right in (0, 1):
-        for above in (0, 1):
-            c, r = np.floor(column).astype(int) + right, np.floor(row).astype(int) + above
-            inside = (c >= 0) & (c < len(found.x)) & (r >= 0) & (r < len(found.y))
-            value = np.full(len(x), np.nan)
-            value[inside] = found.offset[r[inside], c[inside]]
-            near = np.where(
-                np.isfinite(value), (1 - np.abs(column - c)) * (1 - np.abs(row - r)), 0.0
-            )
-            total += near * np.nan_to_num(value)
-            weight += near
-    return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), np.nan)
 
 
 def path_gcode(path: ToolPath) -> str:
