@@ -1,7 +1,9 @@
 """The live page in a real browser, where there is one: points drawn, counts true, reconnection."""
 
+import os
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +13,19 @@ pytest.importorskip("playwright", reason="playwright is not installed")
 from playwright.sync_api import sync_playwright
 
 from omsm_ros.core.correction.surface_points import POINT_DTYPE
+from omsm_ros.core.samples.blocks import AccelerationBlock
 from omsm_ros.report.live.page import render
 from omsm_ros.viewing.live_view import LiveView
 from omsm_ros.viewing.server import LiveServer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
+MINUTES = float(os.environ.get("OMSM_SOAK_MINUTES", "60"))
+MOST_GROWTH = 0.01
+HEAP = "(gc(), performance.memory.usedJSHeapSize)"
 OPTIONS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--enable-precise-memory-info", "--js-flags=--expose-gc",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 
@@ -82,3 +89,45 @@ def test_points_are_drawn_counted_and_told_anew_after_a_restart(page):
     wait_for(page, f"livePage.frames > {frames}")
     assert page.inner_text("#link") == "live"
     again.stop()
+
+
+def held_bytes():
+    """Memory of this process, which has the server in it."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split("RssAnon:")[1].split()[0])
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+def test_an_hour_without_growing(page):
+    """A cell at 1 kHz with an accelerometer, scan after scan, watched by one page all the time.
+
+    Its trace of the error is half an hour long, so the second half of the hour is looked at.
+    """
+    view = LiveView()
+    server = LiveServer(view, render("Cell 1"), "127.0.0.1", 0)
+    server.start()
+    page.goto(server.address)
+    scan, random = spiral(254_000), np.random.default_rng(0)
+    seconds, held = round(60 * MINUTES), []
+    begin = time.monotonic()
+    for second in range(seconds):
+        view.add_points(np.take(scan, range(1000 * second, 1000 * second + 1000), mode="wrap"))
+        for node in ("driver", "corrector", "calibrator", "recorder", "vibration_monitor"):
+            view.add_state(node, "OK", f"second {second}", {"received": str(1000 * second)})
+        stamp = 10**9 * second
+        view.add_acceleration(
+            AccelerationBlock(
+                stamp_ns=stamp, first_sample=2000 * second, sample_period=5e-4,
+                **dict(zip("xyz", random.normal(0, 0.01, (3, 2000)), strict=True)),
+            )
+        )  # fmt: skip
+        page.wait_for_timeout(max(0.0, 1e3 * (begin + second + 1 - time.monotonic())))
+        if second % 60 == 59 and second > seconds / 2:
+            held.append((held_bytes(), page.evaluate(HEAP)))
+            print(second + 1, held[-1], flush=True)
+    wait_for(page, f"livePage.told.points === {1000 * seconds}")
+    assert page.troubles == []
+    server.stop()
+    early, late = (np.median(part, axis=0) for part in np.array_split(np.array(held), 2))
+    assert np.all(late < (1 + MOST_GROWTH) * early), late / early
