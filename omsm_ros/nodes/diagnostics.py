@@ -7,7 +7,6 @@ nothing comes.  ERROR: it cannot. What went wrong longer than WINDOW_S ago is a 
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -23,7 +22,8 @@ STALE = DiagnosticStatus.STALE
 
 _SEVERITY = (OK, WARN, STALE, ERROR)
 _COMPLAINT_PERIOD_S = 5.0
-_defects: Counter[str] = Counter()
+# By node: how many, and the line of the last one.
+_defects: dict[str, tuple[int, str]] = {}
 
 
 @dataclass
@@ -67,9 +67,10 @@ class Diagnostics:
         """Publish now."""
         report = self._report()
         _add_clock(self._node, report)
-        if defects := _defects[self._node.get_fully_qualified_name()]:
-            report.values["defects"] = defects
-            report.add(ERROR, f"{defects} defects of ours, see the log")
+        count, last = _defects.get(self._node.get_fully_qualified_name(), (0, ""))
+        if count:
+            report.values["defects"] = count
+            report.add(ERROR, f"{last} ({count} in all)")
         status = DiagnosticStatus(
             level=report.level,
             name=self._node.get_fully_qualified_name(),
@@ -92,7 +93,7 @@ def survive(node: Node, err: Exception) -> str:
     """Count and log a defect of ours; return the line that says what to report."""
     if os.environ.get(DEBUG):
         raise err
-    _defects[node.get_fully_qualified_name()] += 1
-    line = defect(err)
+    name, line = node.get_fully_qualified_name(), defect(err)
+    _defects[name] = (_defects.get(name, (0, ""))[0] + 1, line)
     node.get_logger().error(line, throttle_duration_sec=_COMPLAINT_PERIOD_S)
     return line
