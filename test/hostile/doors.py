@@ -165,7 +165,7 @@ _ON_RESULTS = [
     ("difference", "result", "bad", "--out", "out"),
     ("export", "bad", "--out", "e.csv"),
     ("history", "--catalogue", "new.sqlite", "--add", "bad"),
-    ("report", "bad", "--calibration", "cal.json"),
+    ("report", "bad", "--calibration", "cal.json", *_ON_SURFACE),
 ]
 
 
