@@ -19,7 +19,7 @@ from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
 from omsm_ros.cli.words import TASKS, WORDS
-from omsm_ros.errors import DEBUG, OmsmError, defect, one_line
+from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
 from omsm_ros.storage import strict_json
 
 if TYPE_CHECKING:  # it would load what reads bags, for a list of words
@@ -153,6 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_WHAT_NEXT)
         return DONE
     try:
+        _check_words(given)
         own, passed_on = _split(given)
         named = [a for a in own if a in WORDS][:1]
         args = parser_of(named).parse_args(own)
@@ -186,6 +187,15 @@ def _unforeseen(err: Exception) -> int:
         return BAD_INPUT
     _say(defect(err))
     return DEFECT
+
+
+def _check_words(given: list[str]) -> None:
+    """Raise ConfigurationError for a word that ends in the middle, as no name of a file does."""
+    for word in given:
+        if "\0" in word:
+            raise ConfigurationError(
+                f"argument {quantities.shown(word)} holds a null character; leave it out"
+            )
 
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:

@@ -7,6 +7,7 @@ often it is given. SQLAlchemy is an optional package, loaded where a catalogue i
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -60,7 +61,9 @@ class Catalogue:
                 "-c client_encoding=UTF8"  # of a base that has none, all would be bytes
             )
         self._tables = _tables(sqlalchemy)
-        with self._translated():
+        with self._translated(), warnings.catch_warnings():
+            # A part of the address that is not understood is refused, not passed over.
+            warnings.simplefilter("error", sqlalchemy.exc.SAWarning)
             # No pool: a command adds one row and ends.
             self._engine = sqlalchemy.create_engine(
                 self.address, connect_args=waiting, poolclass=sqlalchemy.pool.NullPool

@@ -333,6 +333,10 @@ def test_what_is_no_file_is_refused_at_once(place, words, path):
     judge(case, answer, place)
 
 
+def test_a_word_with_a_null_character_is_refused(place):
+    assert r"'a\x00b'" in refused(place, (*IMPORT[:-1], "a\0b"), "log.csv", b"n\n")
+
+
 @pytest.mark.parametrize("out", ["/dev/null", "/dev/full", "pipe"])
 def test_a_device_is_never_replaced_by_a_file(place, out):
     with pytest.raises(FileError, match="a device or a pipe"):

@@ -1,12 +1,14 @@
 """A scan as self-calibration and reversal see it: heights, where on the part, how Z moved.
 
-The axes never drop out, so velocities are taken from them alone, by a local polynomial
-(Savitzky-Golay); a reading that is missing costs its own point only.
+Axes hardly ever drop out, so velocities are taken from them alone, by a local polynomial
+(Savitzky-Golay); a reading that is missing costs its own point only, an axis' its neighbours too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage, signal
@@ -85,7 +87,7 @@ class ScanReader:
         """Take in the next axis block, before the points that come of it."""
         if self._first is None:
             self._first = block.first_sample
-        self._axes.append(block)
+        self._axes += _known_parts(block)
 
     def add(self, points: SurfacePoints) -> None:
         """Take in the next points, corrected with no geometry and no lateral lag."""
@@ -146,6 +148,20 @@ class ScanReader:
         return np.asarray(
             ndimage.convolve1d(values, self._kernels[kernel], mode="nearest"), np.float64
         )
+
+
+def _known_parts(block: AxisBlock) -> Iterator[AxisBlock]:
+    """Yield what lies between samples that were lost: a gap, whichever way they went missing."""
+    columns = {name: getattr(block, name) for name in "xyzbc"}
+    known = np.all(np.isfinite([*columns.values()]), axis=0)
+    edges = [0, *(np.flatnonzero(np.diff(known)) + 1), len(block)]
+    for start, stop in pairwise(map(int, edges)):
+        if known[start]:
+            yield replace(
+                block,
+                first_sample=block.first_sample + start,
+                **{name: values[start:stop] for name, values in columns.items()},
+            )
 
 
 def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:

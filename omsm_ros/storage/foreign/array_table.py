@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 import warnings
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -21,10 +24,13 @@ from omsm_ros.storage.files import open_regular, said
 from omsm_ros.storage.foreign.table import PIECE_ROWS, ForeignTable
 from omsm_ros.storage.hdf5_walk import walked
 
-# What is loaded whole: NumPy's and MATLAB's own files.
+# What is loaded whole: archives of NumPy, MATLAB's own files.
 _MAX_WHOLE_BYTES = 4_000_000_000
+# No recording is packed a hundred times; an archive that is, and is large, was made to fill memory.
+_MAX_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 100_000_000
 _MAX_COLUMNS = 1000
 
+_MATLAB_PACKED = 15  # miCOMPRESSED of "MAT-File Format"
 _INDEXED = re.compile(r"(.*)\[(\d{1,4})\]")
 
 
@@ -63,21 +69,40 @@ class ArrayTable(ForeignTable):
 
     def _numpy(self) -> Mapping[str, Any]:
         with open_regular(self.path, FileError, "table") as stream:
-            loaded = np.load(stream)  # no pickles, by default
-            if isinstance(loaded, np.ndarray):
-                return {"": loaded}
+            if zipfile.is_zipfile(stream):
+                with zipfile.ZipFile(stream) as archive:
+                    self._check_unpacked(sum(member.file_size for member in archive.infolist()))
+            stream.seek(0)
+            alone = stream.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX
+            stream.seek(0)
+            # Pickles are refused, by default.
+            if alone:
+                return {"": np.load(self.path, mmap_mode="r")}
+            loaded = np.load(stream)
             return {name: loaded[name] for name in loaded.files}
 
     def _matlab(self) -> Mapping[str, Any]:
         from scipy.io import loadmat
 
         with open_regular(self.path, FileError, "table") as stream:
-            if stream.read(10) == b"MATLAB 7.3":  # which is HDF5 under another name
+            head = stream.read(10)
+            if head == b"MATLAB 7.3":  # which is HDF5 under another name
                 return self._hdf5()
+            if head == b"MATLAB 5.0":
+                self._check_unpacked(_unpacked_matlab(stream))
         with warnings.catch_warnings():  # complex numbers would lose a part without a word
             warnings.simplefilter("error", np.exceptions.ComplexWarning)
             loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
         return loaded
+
+    def _check_unpacked(self, size: int) -> None:
+        """Raise FileError for an archive that holds far more bytes than any recording would."""
+        packed = self.path.stat().st_size
+        if size > max(_MAX_PACKED * packed, _ALWAYS_UNPACKED_BYTES):
+            raise FileError(
+                f"{self} has {packed} bytes and would unpack to {size}; check that it is a "
+                "recording, and leave out what is none"
+            )
 
     def _hdf5(self) -> Mapping[str, Any]:
         try:
@@ -92,7 +117,10 @@ class ArrayTable(ForeignTable):
             if isinstance(item, h5py.Dataset):
                 # MATLAB writes a column of numbers as a table of one row.
                 row = item.ndim == 2 and item.shape[0] == 1
-                found[name] = item[0] if row else item
+                if row and item.dtype.names is not None and item.nbytes < _ALWAYS_UNPACKED_BYTES:
+                    found[name] = item[0]
+                else:
+                    found[name] = _Row(item) if row else item
                 stated = item.attrs.get("units", item.attrs.get("unit"))
                 if isinstance(stated, str):
                     self.units[name] = stated
@@ -124,6 +152,37 @@ class ArrayTable(ForeignTable):
         indexed = _INDEXED.fullmatch(name)
         assert indexed is not None  # it is one of self.names
         return self._arrays[indexed[1]], int(indexed[2])
+
+
+class _Row:
+    """A data set of one row (1, n) as a column (n,), read piece by piece."""
+
+    ndim = 1
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset, self.dtype = dataset, dataset.dtype
+
+    def __len__(self) -> int:
+        return int(self._dataset.shape[1])
+
+    def __getitem__(self, rows: slice) -> Any:
+        return self._dataset[0, rows]
+
+
+def _unpacked_matlab(stream: IO[bytes]) -> int:
+    """Return how many bytes the variables of a MATLAB 5 file say that they have when unpacked."""
+    stream.seek(126)
+    order = "<" if stream.read(2) == b"IM" else ">"
+    total = 0
+    while len(head := stream.read(8)) == 8:
+        kind, size = struct.unpack(f"{order}II", head)
+        after = stream.tell() + size
+        if kind == _MATLAB_PACKED:
+            inside = zlib.decompressobj().decompress(stream.read(min(size, 1000)), 8)
+            size = struct.unpack(f"{order}II", inside)[1]
+        total += size
+        stream.seek(after)
+    return total
 
 
 def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:

@@ -88,6 +88,23 @@ def test_a_gap_in_the_axes_costs_its_neighbours(
     assert len(reader.columns()) == len(whole) - 1000 - 24
 
 
+def test_a_lost_sample_of_an_axis_costs_its_neighbours(
+    recording: Recording, points: SurfacePoints, whole: ScanColumns
+) -> None:
+    z = recording.axes.z.copy()
+    z[3000] = np.nan
+    place = int(np.flatnonzero(points.sample == 3000)[0])
+    kept = join_points([points.part(slice(0, place)), points.part(slice(place + 1, None))])
+    found = read_scan(replace(recording.axes, z=z), kept)
+    assert len(found) == len(whole) - 1 - 24
+    later = whole.time > 3.1
+    for name in ("radius", "motion_rate", "angular_rate"):
+        got, expected = getattr(found, name), getattr(whole, name)[later]
+        np.testing.assert_allclose(got[found.time > 3.1], expected, atol=1e-12)
+    turns = (found.angle[found.time > 3.1] - whole.angle[later]) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+
+
 def test_scans_of_different_rings_are_refused(whole: ScanColumns) -> None:
     elsewhere = replace(whole, radius=whole.radius + 20e-3)
     with pytest.raises(DataError, match="share no ring"):
