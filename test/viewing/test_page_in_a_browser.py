@@ -21,7 +21,8 @@ from omsm_ros.viewing.server import LiveServer
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
 MINUTES = float(os.environ.get("OMSM_SOAK_MINUTES", "60"))
-MOST_GROWTH = 0.01
+# Half an hour at 1 kHz kept at four bytes a point would be seven times as much.
+MOST_GROWTH_BYTES = 2**20
 HEAP = "(gc(), performance.memory.usedJSHeapSize)"
 OPTIONS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -129,5 +130,6 @@ def test_an_hour_without_growing(page):
     wait_for(page, f"livePage.told.points === {1000 * seconds}")
     assert page.troubles == []
     server.stop()
-    early, late = (np.median(part, axis=0) for part in np.array_split(np.array(held), 2))
-    assert np.all(late < (1 + MOST_GROWTH) * early), late / early
+    # Messages on their way come and go: the least is what is kept.
+    early, late = (np.min(part, axis=0) for part in np.array_split(np.array(held), 2))
+    assert np.all(late - early < MOST_GROWTH_BYTES), late - early
