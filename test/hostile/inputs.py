@@ -92,7 +92,7 @@ def _change(draw: st.DrawFn, content: dict[str, Any]) -> None:
         match draw(st.sampled_from(["set", "scale", "drop", "more"])):
             case "set":
                 value[place] = draw(NUMBERS)
-            case "scale" if isinstance(value[place], int | float):
+            case "scale" if isinstance(value[place], int | float) and abs(value[place]) < 2**64:
                 value[place] *= draw(st.sampled_from([-1, 0, 1e-30, 1e-3, 1e3, 1e5, 1e30]))
             case "drop":
                 del value[place]

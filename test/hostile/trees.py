@@ -37,7 +37,7 @@ def changed(draw: st.DrawFn, whole: Any) -> Any:
                 inside[key] = draw(NUMBERS)
             case "value":
                 inside[key] = draw(VALUES)
-            case "scale" if isinstance(value, int | float):
+            case "scale" if isinstance(value, int | float) and abs(value) < 2**64:
                 inside[key] = value * draw(_SCALES)
             case "drop":
                 del inside[key]

@@ -108,7 +108,7 @@ class FormBasis:
         form = np.array(groups) >= 2
         if not np.any(form):
             raise DataError(
-                "the points lie at so few places that no form shows in them; scan across the part"
+                "the points lie at so few places that no form shows; measure across the part"
             )
         return cls(disc, np.array(rows)[form], np.array(groups)[form])
 
