@@ -123,9 +123,12 @@ def rows(full: bool) -> Iterator[Row]:
     """Coverage at k = 2, and the rms error over the rms of what is stated."""
     runs, feed = (200, 1e-3) if full else (6, 1e-3)
     bars = (92.0, 98.0) if full else (60.0, 100.0)
-    made = [scans(seed, feed) for seed in range(1, runs + 1)]
-    for fitted, of_one in zip(FITS, zip(*made, strict=True), strict=True):
-        found = deviations(of_one)
+    by_fit: list[dict[str, list[tuple[float, float]]]] = [{} for _ in FITS]
+    for seed in range(1, runs + 1):
+        for found, scan in zip(by_fit, scans(seed, feed), strict=True):
+            for name, pairs in deviations([scan]).items():
+                found.setdefault(name, []).extend(pairs)
+    for fitted, found in zip(FITS, by_fit, strict=True):
         terms = [p for name, pairs in found.items() if name.startswith("zernike") for p in pairs]
         groups = {n: p for n, p in found.items() if not n.startswith("zernike")}
         for name, pairs in (groups | {f"first {TERMS} Zernike terms": terms}).items():

@@ -66,7 +66,9 @@ def test_the_twins_motion_comes_out(
     blocks = play(name, link, step_test)
     axes = [b.axes for b in blocks if b.axes is not None]
     distances = [b.distance for b in blocks if b.distance is not None]
-    assert [b.first_sample for b in distances] == list(range(0, len(step_test.axes), 100))
+    # On a busy host a block may be closed early.
+    counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in distances])
+    np.testing.assert_array_equal(counts, np.arange(len(step_test.axes)))
     distance = np.concatenate([b.distance for b in distances])
     status = np.concatenate([b.status for b in distances])
     np.testing.assert_array_equal(status == Status.OK, step_test.distance.status == Status.OK)

@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -249,7 +250,7 @@ def test_a_sqlite_bag_without_definitions(importer):
     folder = importer.folder / "old"
     folder.mkdir()
     messages = list(ranges(40))
-    with sqlite3.connect(folder / "old_0.db3") as base:
+    with closing(sqlite3.connect(folder / "old_0.db3")) as base, base:
         base.execute(
             "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
             "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"

@@ -1,6 +1,7 @@
 """A catalogue that somebody changed by hand is told in one line, and never believed."""
 
 import sqlite3
+from contextlib import closing
 
 import pytest
 
@@ -30,7 +31,7 @@ def address(tmp_path, true_calibration):
     ],
 )
 def test_a_row_that_cannot_be_is_named(address, change, told):
-    with sqlite3.connect(address) as base:
+    with closing(sqlite3.connect(address)) as base, base:
         base.execute(f"UPDATE calibrations SET {change}")
     with pytest.raises(FileError, match=r"catalogue .*catalogue.sqlite") as refusal:
         history(address)
@@ -39,7 +40,7 @@ def test_a_row_that_cannot_be_is_named(address, change, told):
 
 def test_a_view_without_end_is_given_up(address, monkeypatch):
     monkeypatch.setattr("omsm_ros.storage.catalogue.WAIT_S", 0.2)
-    with sqlite3.connect(address) as base:
+    with closing(sqlite3.connect(address)) as base, base:
         columns = [row[1] for row in base.execute("PRAGMA table_info(calibrations)")]
         base.execute("DROP TABLE calibrations")
         base.execute(
