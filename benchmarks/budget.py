@@ -7,7 +7,7 @@ figure error of the part, less the freedoms that were fitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -104,18 +104,16 @@ def _form(
     )
 
 
-def deviations(scans: Iterable[Scan]) -> dict[str, list[tuple[float, float]]]:
-    """By figure, the error and the stated standard uncertainty of each scan [m]."""
-    found: dict[str, list[tuple[float, float]]] = {}
-    for made in scans:
-        for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
-            told, true = made.measured.deviation[name], made.true.deviation[name]
-            found.setdefault(name, []).append((told.value - true.value, told.uncertainty))
-        told_terms, true_terms = made.measured.zernike, made.true.zernike
-        errors = told_terms.coefficients - true_terms.coefficients
-        for k in range(TERMS):
-            pair = float(errors[k]), float(told_terms.uncertainty[k])
-            found.setdefault(f"zernike {k + 1}", []).append(pair)
+def deviations(scan: Scan) -> dict[str, tuple[float, float]]:
+    """By figure, its error and its stated standard uncertainty [m]."""
+    found: dict[str, tuple[float, float]] = {}
+    for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
+        told, true = scan.measured.deviation[name], scan.true.deviation[name]
+        found[name] = told.value - true.value, told.uncertainty
+    told_terms, true_terms = scan.measured.zernike, scan.true.zernike
+    errors = told_terms.coefficients - true_terms.coefficients
+    for k in range(TERMS):
+        found[f"zernike {k + 1}"] = float(errors[k]), float(told_terms.uncertainty[k])
     return found
 
 
@@ -126,8 +124,8 @@ def rows(full: bool) -> Iterator[Row]:
     by_fit: list[dict[str, list[tuple[float, float]]]] = [{} for _ in FITS]
     for seed in range(1, runs + 1):
         for found, scan in zip(by_fit, scans(seed, feed), strict=True):
-            for name, pairs in deviations([scan]).items():
-                found.setdefault(name, []).extend(pairs)
+            for name, pair in deviations(scan).items():
+                found.setdefault(name, []).append(pair)
     for fitted, found in zip(FITS, by_fit, strict=True):
         terms = [p for name, pairs in found.items() if name.startswith("zernike") for p in pairs]
         groups = {n: p for n, p in found.items() if not n.startswith("zernike")}

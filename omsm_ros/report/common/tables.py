@@ -22,11 +22,15 @@ _FIGURE_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """``rows`` of a label and one text a column; ``columns`` may be empty for no heading."""
+    """``rows`` of a label and one text a column; ``columns`` may be empty for no heading.
+
+    prose: the column that holds sentences rather than figures, empty for none
+    """
 
     title: str
     columns: Sequence[str]
     rows: Sequence[tuple[str, ...]]
+    prose: str = ""
 
 
 def part(mapping: Mapping[str, Any], *path: str) -> Any:
@@ -67,6 +71,7 @@ def budget_table(summary: Mapping[str, object]) -> Table:
         "Uncertainty of the heights, k = 1, rms over the scan",
         ("of the source", "of the heights", "acts", "known by"),
         [_budget_row(row) for row in ordered],
+        prose="known by",
     )
 
 
