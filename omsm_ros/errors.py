@@ -89,9 +89,14 @@ def one_line(text: object) -> str:
     Names and words in it come from outside: they may have any length, and what would steer a
     terminal is written out.
     """
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(str(text).split()))
+    line = printable(" ".join(str(text).split()))
     half = _LONGEST_LINE // 2
     return line if len(line) <= _LONGEST_LINE else f"{line[:half]} … {line[-half:]}"
+
+
+def printable(text: str) -> str:
+    """Return ``text`` with all that would steer a terminal, ends of lines too, written out."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def defect(err: BaseException) -> str:

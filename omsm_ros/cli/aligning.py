@@ -8,8 +8,9 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, cell_of, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
+from omsm_ros.cli.printing import table
 from omsm_ros.jobs.study_scans import alignment_of
 from omsm_ros.readable import measured, quantity
 from omsm_ros.storage.calibration_file import load_calibration

@@ -19,7 +19,8 @@ from omsm_ros.cli.arguments import (
     number,
     trigger_of,
 )
-from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
+from omsm_ros.cli.printing import say, say_lines, table
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
 from omsm_ros.core.machine.step_plan import (
@@ -83,16 +84,16 @@ def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
 
 def _show_verify(facts: Facts) -> None:
     if offset := facts.get("counter_offset"):
-        print(
+        say(
             f"counter offset {offset['samples']} samples; left of it "
             f"{offset['fraction']:.3f} ± {offset['uncertainty']:.3f} (k = 1)"
         )
-    print("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
+    say("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
     for band in facts["bands"]:
         errors = (quantity(band[f"error_{w}"], "m") for w in ("before", "after"))
         lags = (quantity(band[f"lag_{w}"] / DEGREE_RAD, "°") for w in ("before", "after"))
-        print(f"{band['from']:3.0f}-{band['to']:<3.0f}", *(f"{x:>12}" for x in (*errors, *lags)))
-    print("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
+        say(f"{band['from']:3.0f}-{band['to']:<3.0f}", *(f"{x:>12}" for x in (*errors, *lags)))
+    say("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
 
 
 def _declare_compare(sub: argparse.ArgumentParser) -> None:
@@ -247,6 +248,6 @@ def _show_calset(facts: Facts) -> None:
 COMMANDS = (
     Command("plan", _declare_plan, _plan, _show_plan),
     Command("verify", _declare_verify, _verify, _show_verify),
-    Command("compare", _declare_compare, _compare, lambda facts: print(facts["text"])),
+    Command("compare", _declare_compare, _compare, lambda facts: say_lines(facts["text"])),
     Command("calset", _declare_calset, _calset, _show_calset, rejected),
 )

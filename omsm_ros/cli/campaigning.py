@@ -12,6 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.catalogue_option import ADDRESS, declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar
+from omsm_ros.cli.printing import say
 from omsm_ros.jobs.run_campaign import DONE, Entry, load_summary, run_campaign
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import REPORT, save_text
@@ -78,9 +79,9 @@ def _link(out: Path, entry: Entry) -> str:
 def _show_batch(facts: Facts) -> None:
     for entry in facts["entries"]:
         if entry["state"] != DONE:
-            print(f"{entry['bag']}: {entry['state']}, {entry['said']}")
+            say(f"{entry['bag']}: {entry['state']}, {entry['said']}")
     done = sum(entry["state"] == DONE for entry in facts["entries"])
-    print(f"{done} of {len(facts['entries'])} bags are done; see {facts['out']}/{_INDEX}")
+    say(f"{done} of {len(facts['entries'])} bags are done; see {facts['out']}/{_INDEX}")
 
 
 def _undone(facts: Facts) -> str:

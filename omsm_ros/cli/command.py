@@ -61,10 +61,3 @@ def rejected(facts: Facts) -> str:
         return ""
     kept = facts.get("calibration") or facts["model"]
     return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {kept!r}"
-
-
-def table(rows: list[tuple[str, str]]) -> None:
-    """Print names and values in two columns; nothing where there are none."""
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        print(f"{name:<{width}}  {value}")

@@ -18,6 +18,7 @@ from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
+from omsm_ros.cli.printing import say, say_lines
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
 from omsm_ros.storage import strict_json
@@ -126,8 +127,8 @@ def _experiment(args: argparse.Namespace) -> int:
         print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
         return DONE
     for row in facts["compared"]:
-        print(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
-    print(f"written: {args.out / 'report.html'}")
+        say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
+    say(f"written: {args.out / 'report.html'}")
     return DONE
 
 
@@ -150,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
     if not given:
-        print(_WHAT_NEXT)
+        say_lines(_WHAT_NEXT)
         return DONE
     try:
         _check_words(given)
@@ -160,17 +161,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:
-        _say(str(err))
+        _complain(str(err))
         return BAD_INPUT
     except KeyboardInterrupt:
-        _say(INTERRUPTION)
+        _complain(INTERRUPTION)
         return INTERRUPTED
     except BrokenPipeError:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except MemoryError as err:
-        _say(f"memory is short: {err or 'none is left'}; give less at once")
+        _complain(f"memory is short: {err or 'none is left'}; give less at once")
         return BAD_INPUT
     except Exception as err:
         if os.environ.get(DEBUG):
@@ -183,9 +184,9 @@ def _unforeseen(err: Exception) -> int:
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _OF_A_DISK):
         # Of a place that the system refuses: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else quantities.shown(os.fsdecode(err.filename))
-        _say(f"{path}: {err.strerror}; check the path, its permissions and the disk")
+        _complain(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
-    _say(defect(err))
+    _complain(defect(err))
     return DEFECT
 
 
@@ -216,10 +217,10 @@ def _run(args: argparse.Namespace) -> int:
     else:
         args.run.show(facts)
     if refusal := args.run.refusal(facts):
-        _say(refusal)
+        _complain(refusal)
         return BAD_INPUT
     return DONE
 
 
-def _say(text: str) -> None:
+def _complain(text: str) -> None:
     print("omsm:", one_line(text), file=sys.stderr)

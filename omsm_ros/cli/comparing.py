@@ -7,19 +7,19 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
-from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.cli.command import Command, Facts
 from omsm_ros.cli.fit_option import freedoms
+from omsm_ros.cli.printing import table
 from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.compare_measurements import (
-    DIFFERENCE,
     MAP,
     ComparisonOptions,
     compare_measurements,
     write_difference,
 )
 from omsm_ros.readable import count, figure, percent, plain, quantity
-from omsm_ros.storage.files import REPORT
+from omsm_ros.storage.files import DIFFERENCE, REPORT
 from omsm_ros.storage.result_folder import result_folder
 from omsm_ros.storage.surface_file import load_surface
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from omsm_ros.cli.command import Command, Facts
+from omsm_ros.cli.printing import say_lines
 from omsm_ros.errors import ConfigurationError
 
 SHELLS = ("bash", "zsh", "tcsh")
@@ -46,7 +47,7 @@ def _prepare(parser: argparse.ArgumentParser, files: object) -> None:
 
 
 def _show_completion(facts: Facts) -> None:
-    print(facts["script"])
+    say_lines(facts["script"])
 
 
 COMMANDS = (Command("completion", _declare_completion, _completion, _show_completion),)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
-from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.cli.command import Command, Facts
+from omsm_ros.cli.printing import table
 from omsm_ros.jobs.export_points import export
 from omsm_ros.readable import count, quantity
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, add_bags, cell_of, number, refuse_cell
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
+from omsm_ros.cli.printing import table
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.registration.freedoms import AUTO
 from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
@@ -17,13 +18,11 @@ from omsm_ros.jobs.measured_portions import open_measurement
 from omsm_ros.jobs.show_surface import Scan, show_surface
 from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.files import CURVES, DEVIATION, FORM, REPORT
 from omsm_ros.storage.machine_files import load_limits
-from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.result_folder import FORM_FILES, MEASUREMENT_FILES, result_folder
 from omsm_ros.storage.surface_file import load_surface
 from omsm_ros.units import DEGREE_RAD
-
-_WRITTEN = (CLOUD, SYSTEMATIC, SUMMARY, DEVIATION, CURVES, FORM, REPORT)
 
 
 def _declare_form(sub: argparse.ArgumentParser) -> None:
@@ -46,7 +45,7 @@ def _declare_form(sub: argparse.ArgumentParser) -> None:
 
 def _form(args: argparse.Namespace) -> Facts:
     surface, filters = load_surface(args.nominal), (args.s_filter, args.l_filter)
-    with result_folder(args.out, _WRITTEN) as out:
+    with result_folder(args.out, MEASUREMENT_FILES if args.calibration else FORM_FILES) as out:
         source = args.measured
         if args.calibration:
             # Here, because what corrects takes longer to load than many a form to judge.

@@ -17,7 +17,8 @@ from omsm_ros.cli.arguments import (
     trigger_of,
 )
 from omsm_ros.cli.catalogue_option import declare_catalogue
-from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
+from omsm_ros.cli.printing import table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.sampled.identify_samples import HOLDS

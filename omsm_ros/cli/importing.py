@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from omsm_ros.cli.command import Command, Facts, progress_bar
+from omsm_ros.cli.printing import say
 from omsm_ros.jobs.import_recording import import_recording
 from omsm_ros.storage.column_map_file import load_column_map
 
@@ -29,7 +30,7 @@ def _import(args: argparse.Namespace) -> Facts:
 def _show_import(facts: Facts) -> None:
     for file in facts["files"]:
         kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
-        print(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
+        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
         for count, meaning in (
             ("missing", "trigger numbers that are missing"),
             ("invalid", "readings that are none"),
@@ -38,10 +39,10 @@ def _show_import(facts: Facts) -> None:
             ("passed_over", "messages with none of the columns"),
         ):
             if file[count]:
-                print(f"    {meaning}: {file[count]}")
+                say(f"    {meaning}: {file[count]}")
     if any(file["own_clock"] for file in facts["files"]):
-        print("probe and axes have clocks of their own: identify and correct with --by-stamps")
-    print(f"written: {facts['bag']}; look at it with 'omsm inspect'")
+        say("probe and axes have clocks of their own: identify and correct with --by-stamps")
+    say(f"written: {facts['bag']}; look at it with 'omsm inspect'")
 
 
 COMMANDS = (Command("import", _declare_import, _import, _show_import),)

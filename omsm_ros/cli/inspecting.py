@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from omsm_ros.cli.arguments import add_bags, cell_of
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, progress_bar
+from omsm_ros.cli.printing import say, table
 from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
@@ -48,10 +49,10 @@ def _show(facts: Facts) -> None:
         return
     row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
     names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
-    print(row.format(rate="rate Hz", **{name: name for name in names}))
+    say(row.format(rate="rate Hz", **{name: name for name in names}))
     for topic in facts["topics"]:
         period = topic["sample_period"]
-        print(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+        say(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
     faults = [("fault", text) for text in facts["faults"]] or [("faults", "none found")]
     table([*_vibration(facts["vibration"]), *faults])
 

@@ -21,8 +21,9 @@ from omsm_ros.cli.arguments import (
     trigger_of,
 )
 from omsm_ros.cli.catalogue_option import declare_catalogue
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
+from omsm_ros.cli.printing import table
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
@@ -37,10 +38,9 @@ from omsm_ros.jobs.remember import remembered
 from omsm_ros.readable import percent, plain, quantity
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
 from omsm_ros.storage.machine_files import load_geometry, load_limits, load_pitch
 from omsm_ros.storage.motion_file import load_motion
-from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.result_folder import MEASUREMENT_FILES, result_folder
 from omsm_ros.storage.sources_file import load_sources
 from omsm_ros.storage.surface_file import load_surface
 
@@ -141,9 +141,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             "--pitch without an Abbe arm does nothing; give abbe_arm in --geometry GEOMETRY.yaml"
         )
     with (
-        result_folder(
-            args.out, (CLOUD, SYSTEMATIC, DEVIATION, CURVES, FORM, REPORT, SUMMARY)
-        ) as out,
+        result_folder(args.out, MEASUREMENT_FILES) as out,
         progress_bar("correcting", args.json) as progress,
     ):
         summary = measure(

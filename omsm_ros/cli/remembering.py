@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omsm_ros.cli.catalogue_option import declare_catalogue
-from omsm_ros.cli.command import Command, Facts, table
+from omsm_ros.cli.command import Command, Facts
+from omsm_ros.cli.printing import say, table
 from omsm_ros.core.verification.trend import Trend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
@@ -19,6 +20,7 @@ if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
     from omsm_ros.jobs.keep_history import MachineHistory
 
 _SHOWN_ROWS = 20
+_MOST_DRAWN = 30
 _USUAL = "catalogue.sqlite"
 _NO_NAME = """(no machine named; identify and correct with --settings '{"machine": "…"}')"""
 
@@ -47,12 +49,18 @@ def _history(args: argparse.Namespace) -> Facts:
         from omsm_ros.report.campaign.history_figure import draw
         from omsm_ros.storage.files import save_bytes
 
-        save_bytes(args.plot, draw(found))
+        if len(found.machines) > _MOST_DRAWN:
+            raise ConfigurationError(
+                f"--plot of {count(len(found.machines))} machines, expected {_MOST_DRAWN} at most; "
+                "choose one with --machine"
+            )
+        save_bytes(args.plot, draw(found.machines))
     return {
         "catalogue": address.rpartition("@")[2],
         "added": added,
         **({"figure": str(args.plot)} if args.plot is not None else {}),
-        "machines": [_plain(machine) for machine in found],
+        "older": found.older,
+        "machines": [_plain(machine) for machine in found.machines],
     }
 
 
@@ -72,17 +80,17 @@ def _plain(machine: MachineHistory) -> dict[str, Any]:
 
 def _show_history(facts: Facts) -> None:
     if not facts["machines"]:
-        print(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
+        say(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
     for machine in facts["machines"]:
-        print(machine["machine"] or _NO_NAME)
+        say(machine["machine"] or _NO_NAME)
         for row in machine["calibrations"][-_SHOWN_ROWS:]:
-            print(
+            say(
                 f"  {_when(row)}  calibration {row['id'][:8]}  "
                 f"lag {measured(row['delay'], row['delay_uncertainty'], 's')}  "
                 f"gain {plain(row['static_gain'], 6)}  {row['verdict']}"
             )
         for row in machine["measurements"][-_SHOWN_ROWS:]:
-            print(
+            say(
                 f"  {_when(row)}  {Path(row['bag']).name}  "
                 f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
             )
@@ -94,8 +102,13 @@ def _show_history(facts: Facts) -> None:
                 ("  form's rms drifts a day", _drift(machine["deviation"], "m")),
             ]
         )
+    if facts["older"]:
+        say(
+            f"{count(facts['older'])} older calibrations and measurements are not listed here, "
+            "nor in the drifts; --machine lists one machine"
+        )
     if "figure" in facts:
-        print(f"written: {facts['figure']}")
+        say(f"written: {facts['figure']}")
 
 
 def _when(row: dict[str, Any]) -> str:

@@ -8,8 +8,9 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
-from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
 from omsm_ros.cli.measuring import CALIBRATION
+from omsm_ros.cli.printing import table
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
 from omsm_ros.core.verification.resolved_calibration import undetermined

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table
+from omsm_ros.cli.command import Command, Facts, progress_bar
+from omsm_ros.cli.printing import say, table
 from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
@@ -56,13 +57,13 @@ def _spectrum(args: argparse.Namespace) -> Facts:
 
 def _show_spectrum(facts: Facts) -> None:
     for scan in facts["scans"]:
-        print(f"{scan['name']}: {scan['samples']['analysed']} points, "
+        say(f"{scan['name']}: {scan['samples']['analysed']} points, "
               f"{quantity(scan['noise']['rms'], 'm')} rms without its lines")  # fmt: skip
         table([_peak_row(peak) for peak in scan["peaks"]] or [("", "no line beyond 3 σ")])
         if stopped := scan["band_stop"]:
-            print(f"band stop, no phase: {quantity(stopped['rms_before'], 'm')} → "
+            say(f"band stop, no phase: {quantity(stopped['rms_before'], 'm')} → "
                   f"{quantity(stopped['rms_after'], 'm')} rms")  # fmt: skip
-    print(f"written: {', '.join(facts['files'].values())}")
+    say(f"written: {', '.join(facts['files'].values())}")
 
 
 def _peak_row(peak: Facts) -> tuple[str, str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Command, Facts
+from omsm_ros.cli.printing import say
 from omsm_ros.jobs.examine_host import DOUBTFUL, FAULTY, FINE, examine_host
 from omsm_ros.jobs.record_twin import record_twin
 from omsm_ros.twin.scenario import Scenario
@@ -27,9 +28,9 @@ def _doctor(args: argparse.Namespace) -> Facts:
 
 def _show_doctor(facts: Facts) -> None:
     for check in facts["checks"]:
-        print(f"{_MARKS[check['state']]}  {check['name']:<18} {check['found']}")
+        say(f"{_MARKS[check['state']]}  {check['name']:<18} {check['found']}")
         if check["remedy"]:
-            print(f"    {'':<18} → {check['remedy']}")
+            say(f"    {'':<18} → {check['remedy']}")
 
 
 def _faulty(facts: Facts) -> str:
@@ -73,8 +74,8 @@ def _twin(args: argparse.Namespace) -> Facts:
 
 
 def _show_twin(facts: Facts) -> None:
-    print(f"{facts['steps']}: {facts['step_samples']} samples of a step test on a flat")
-    print(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
+    say(f"{facts['steps']}: {facts['step_samples']} samples of a step test on a flat")
+    say(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
 
 
 COMMANDS = (

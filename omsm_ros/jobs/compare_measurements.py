@@ -31,6 +31,7 @@ from omsm_ros.jobs.registered_points import registered
 from omsm_ros.readable import moment
 from omsm_ros.storage.fields_file import load_fields
 from omsm_ros.storage.files import (
+    DIFFERENCE,
     REPORT,
     SUMMARY,
     SYSTEMATIC,
@@ -42,7 +43,7 @@ from omsm_ros.storage.maps.length_units import LengthUnits
 from omsm_ros.storage.maps.read_map import read_points
 from omsm_ros.storage.result_folder import read_result
 
-DIFFERENCE, MAP = "difference.json", "difference.csv"
+MAP = "difference.csv"
 
 _METHOD = (
     "local quadratic regression on means of square cells, tricube weights over "

@@ -17,9 +17,11 @@ from omsm_ros.errors import FileError
 from omsm_ros.quantities import COUNTER, SIGNAL
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.catalogue import Catalogue, time_of
+from omsm_ros.storage.catalogue import MOST_ROWS, Catalogue, time_of
 from omsm_ros.storage.files import SUMMARY, read_text
 from omsm_ros.storage.result_folder import MAX_RESULT_BYTES
+
+_TABLES = ("calibrations", "measurements")
 
 
 def keep_calibration(
@@ -102,24 +104,41 @@ class MachineHistory:
     deviation: Trend | None
 
 
-def history(address: str, machine: str = "") -> list[MachineHistory]:
-    """Return what the catalogue holds, machine by machine; of one, or of all."""
+@dataclass(frozen=True, slots=True)
+class History:
+    """What a catalogue holds, machine by machine.
+
+    older: how many calibrations and measurements are older than those listed; zero unless a
+        table holds more than ``catalogue.MOST_ROWS``
+    """
+
+    machines: list[MachineHistory]
+    older: int
+
+
+def history(address: str, machine: str = "") -> History:
+    """Return what the catalogue holds; of one machine, or of all."""
+    older = 0
+    rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
     with Catalogue(address) as catalogue:
-        calibrations = catalogue.rows("calibrations", machine)
-        measurements = catalogue.rows("measurements", machine)
-    names = sorted({row["machine"] or "" for row in (*calibrations, *measurements)})
-    return [_of(name, calibrations, measurements) for name in names]
+        for table in _TABLES:
+            found = catalogue.rows(table, machine)
+            if len(found) == MOST_ROWS:
+                older += catalogue.count(table, machine) - len(found)
+            for row in found:
+                name = row["machine"] or ""
+                rows.setdefault(name, {table: [] for table in _TABLES})[table].append(row)
+    return History([_of(name, **rows[name]) for name in sorted(rows)], older)
 
 
 def _of(
     name: str, calibrations: list[dict[str, Any]], measurements: list[dict[str, Any]]
 ) -> MachineHistory:
-    own = [row for row in calibrations if (row["machine"] or "") == name]
-    scans = [row for row in measurements if (row["machine"] or "") == name]
-    accepted = [row for row in own if row["verdict"] != "rejected"]
+    accepted = [row for row in calibrations if row["verdict"] != "rejected"]
     return MachineHistory(
-        name, own, scans,
-        _trend(accepted, "delay"), _trend(accepted, "static_gain"), _trend(scans, "deviation_rms"),
+        name, calibrations, measurements,
+        _trend(accepted, "delay"), _trend(accepted, "static_gain"),
+        _trend(measurements, "deviation_rms"),
     )  # fmt: skip
 
 

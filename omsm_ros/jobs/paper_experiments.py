@@ -25,7 +25,7 @@ from omsm_ros.report.experiments import figures
 from omsm_ros.report.experiments.page import Compared, ExperimentPage, render
 from omsm_ros.report.spectrum.page import CAPTIONS, drawn
 from omsm_ros.storage.files import REPORT, SUMMARY, save_json, save_text
-from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.result_folder import MEASUREMENT_FILES, result_folder
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.channels import Accelerometer
 from omsm_ros.twin.disturbances import Disturbances
@@ -60,7 +60,7 @@ class _Done:
 
 def run_experiment(name: str, out: Path, seed: int = 1) -> dict[str, Any]:
     """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its page, bags and summary."""
-    with result_folder(out, (REPORT, SUMMARY)) as folder:
+    with result_folder(out, MEASUREMENT_FILES) as folder:
         done = EXPERIMENTS[name](folder, seed)
         rows = [asdict(row) for row in done.page.rows]
         facts = {"experiment": name, "seed": seed, "compared": rows, **done.facts}

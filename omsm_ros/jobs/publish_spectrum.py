@@ -15,11 +15,9 @@ from omsm_ros.jobs.spectrum import (
     without_bands,
 )
 from omsm_ros.storage.cloud_file import PlyWriter
-from omsm_ros.storage.files import REPORT, save_json, save_text
+from omsm_ros.storage.files import REPORT, SPECTRUM, save_json, save_text
 from omsm_ros.storage.recording.topics import AnyBag
 from omsm_ros.storage.result_folder import result_folder
-
-SPECTRUM = "spectrum.json"
 
 
 def publish_spectra(
@@ -31,12 +29,12 @@ def publish_spectra(
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Study the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
-    clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))] if options.stop else []
+    clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))]
     with result_folder(out, (*clouds, REPORT, SPECTRUM)) as folder:
         scans = spectra_of(paths, options, progress)
         summary = summary_of(scans, options)
         files = {"spectrum": SPECTRUM}
-        for name, scan in zip(clouds, scans, strict=False):
+        for name, scan in zip(clouds, scans, strict=True) if options.stop else ():
             _write_cloud(folder / name, scan)
             files[f"{scan.studied.signal.name} without the band"] = name
         if report:

@@ -21,7 +21,9 @@ from omsm_ros.units import NANOSECONDS_PER_S
 WAIT_S = 3
 """Longest time that a database may keep a measurement waiting [s]."""
 
-_MOST_ROWS = 100_000
+MOST_ROWS = 10_000
+"""Rows of a table that are read at once: years of one machine, a second's work."""
+
 _STEPS = 100_000  # of SQLite's machine, a millisecond or so
 _SQLITE = "sqlite:///"
 _KINDS = ("sqlite", "postgresql", "postgresql+psycopg")
@@ -101,18 +103,30 @@ class Catalogue:
         return True
 
     def rows(self, table: str, machine: str = "") -> list[dict[str, Any]]:
-        """Return the rows of a table, the oldest first; of one machine, or of all."""
+        """Return the newest ``MOST_ROWS`` of a table, the oldest first; of one machine, or all.
+
+        What was recorded at no known time stands where it was added.
+        """
         source = self._tables[table]
-        asked = self._sql.select(source).limit(_MOST_ROWS)
-        asked = asked.order_by(source.c.recorded_at, source.c.added_at, source.c.id)
-        if machine:
-            asked = asked.where(source.c.machine == machine)
+        when = self._sql.func.coalesce(source.c.recorded_at, source.c.added_at)
+        newest = (when.desc(), source.c.added_at.desc(), source.c.id.desc())
+        asked = self._of(machine, table, self._sql.select(source)).order_by(*newest)
         with self._translated(), self._engine.connect() as connection:
-            found = [dict(row) for row in connection.execute(asked).mappings()]
+            answer = connection.execute(asked.limit(MOST_ROWS)).mappings()
+            found = [dict(row) for row in answer][::-1]
         for column in source.c:
             name = f"catalogue {self._shown_address()!r}: {column.name} of one of the {table}"
             _check(name, column.type.python_type, [row[column.name] for row in found])
         return found
+
+    def count(self, table: str, machine: str = "") -> int:
+        """Return how many rows a table has; of one machine, or of all."""
+        every = self._sql.select(self._sql.func.count()).select_from(self._tables[table])
+        with self._translated(), self._engine.connect() as connection:
+            return int(connection.execute(self._of(machine, table, every)).scalar_one())
+
+    def _of(self, machine: str, table: str, asked: Any) -> Any:
+        return asked.where(self._tables[table].c.machine == machine) if machine else asked
 
     @contextmanager
     def _translated(self) -> Iterator[None]:

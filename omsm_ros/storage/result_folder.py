@@ -12,8 +12,31 @@ from typing import Any
 
 from omsm_ros.errors import FileError
 from omsm_ros.storage import strict_json
-from omsm_ros.storage.files import beside, read_text, said
+from omsm_ros.storage.files import (
+    CLOUD,
+    CURVES,
+    DEVIATION,
+    DIFFERENCE,
+    FORM,
+    REPORT,
+    SPECTRUM,
+    SUMMARY,
+    SYSTEMATIC,
+    beside,
+    read_text,
+    said,
+)
 
+FORM_FILES = (DEVIATION, CURVES, REPORT, FORM)
+MEASUREMENT_FILES = (CLOUD, SYSTEMATIC, *FORM_FILES, SUMMARY)
+
+# Results that have a name in common. A measurement may hold its form.
+_RESULTS = {
+    SUMMARY: MEASUREMENT_FILES,
+    FORM: FORM_FILES,
+    SPECTRUM: (REPORT, SPECTRUM),
+    DIFFERENCE: (REPORT, DIFFERENCE),
+}
 # A summary of ours has tens of kilobytes.
 MAX_RESULT_BYTES = 10_000_000
 
@@ -26,7 +49,8 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
         that the result is whole: it is taken away first and comes last, so that nobody ever
         sees it beside files of another run. Other files in ``path`` stay.
 
-    FileError if it cannot be written there; then, as after any exception, ``path`` is unchanged.
+    FileError if it cannot be written there, or where the result of another command is that has
+    files of these names; then, as after any exception, ``path`` is unchanged.
     """
     target = Path(os.path.abspath(path))
     staged: Path | None = None
@@ -35,6 +59,7 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists() and not target.is_dir():
                 raise NotADirectoryError(None, "it is a file; give a folder")
+            _refuse_foreign(target, names)
             staged = beside(target)
             staged.mkdir()
         except (OSError, ValueError) as err:
@@ -50,6 +75,8 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
 
 
 def _refusal(path: Path | str, err: Exception) -> FileError:
+    if isinstance(err, FileError):
+        return err
     return FileError(
         f"cannot write results into {str(path)!r}: {said(err)}; check the folder, its rights and "
         "its room"
@@ -72,12 +99,23 @@ def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
     lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)  # one writer after the other
+        _refuse_foreign(target, names)
         for name in reversed(names):
             (target / name).unlink(missing_ok=True)
         for part in sorted(staged.iterdir(), key=lambda part: part.name == names[-1]):
             part.replace(target / part.name)
     finally:
         os.close(lock)
+
+
+def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
+    """Raise FileError where the folder holds another command's result with files of these names."""
+    found = next((mark for mark in _RESULTS if (target / mark).is_file()), names[-1])
+    if found != names[-1] and not set(names).isdisjoint(_RESULTS[found]):
+        raise FileError(
+            f"{str(target)!r} holds the result of another command ({found}), whose files would "
+            "be mixed with these; give another folder"
+        )
 
 
 def read_result(path: Path, what: str) -> dict[str, Any]:

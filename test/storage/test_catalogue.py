@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("sqlalchemy", reason="the extra 'catalogue' is not installed")
 
+from omsm_ros import cli
 from omsm_ros.errors import FileError
 from omsm_ros.jobs.keep_history import history, keep_calibration
 from omsm_ros.storage.catalogue import Catalogue
@@ -59,3 +60,41 @@ def test_an_address_that_is_none_is_named_without_its_password(address):
     with pytest.raises(FileError, match="check that it is there") as refusal, Catalogue(address):
         pass
     assert "secret" not in str(refusal.value)
+
+
+def test_of_more_rows_than_are_listed_the_newest_are_and_the_others_counted(
+    capsys, address, true_calibration, monkeypatch
+):
+    monkeypatch.setattr("omsm_ros.storage.catalogue.MOST_ROWS", 3)
+    monkeypatch.setattr("omsm_ros.jobs.keep_history.MOST_ROWS", 3)
+    with closing(sqlite3.connect(address)) as base, base:
+        base.execute("UPDATE calibrations SET added_at = '2026-01-01 00:00:00.000000'")
+        columns = [row[1] for row in base.execute("PRAGMA table_info(calibrations)")]
+        rest = ", ".join(c for c in columns if c not in ("id", "recorded_at", "machine"))
+        # Added in another order than they were recorded; the one of no date is the oldest.
+        for k in (4, 2, 5, 3):
+            base.execute(
+                f"INSERT INTO calibrations (id, recorded_at, machine, {rest}) SELECT 'c{k}', "
+                f"'2026-0{k}-01 00:00:00.000000', 'm{k % 2}', {rest} FROM calibrations LIMIT 1"
+            )
+    found = history(address)
+    listed = [row["id"] for machine in found.machines for row in machine.calibrations]
+    assert (listed, found.older) == (["c4", "c3", "c5"], 2)
+    assert history(address, "m0").older == 0
+    assert cli.main(["history", "--catalogue", address]) == 0
+    assert "2 older calibrations and measurements are not listed" in capsys.readouterr().out
+
+
+def test_a_figure_of_too_many_machines_is_refused(capsys, address, tmp_path):
+    with closing(sqlite3.connect(address)) as base, base:
+        columns = [row[1] for row in base.execute("PRAGMA table_info(calibrations)")]
+        rest = ", ".join(c for c in columns if c not in ("id", "machine"))
+        for k in range(30):
+            base.execute(
+                f"INSERT INTO calibrations (id, machine, {rest}) "
+                f"SELECT 'c{k}', 'm{k}', {rest} FROM calibrations LIMIT 1"
+            )
+    words = ["history", "--catalogue", address, "--plot", str(tmp_path / "h.png")]
+    assert cli.main(words) == 2
+    assert "choose one with --machine" in capsys.readouterr().err
+    assert cli.main([*words, "--machine", "m3"]) == 0

@@ -8,7 +8,7 @@ import pytest
 
 from omsm_ros.errors import FileError
 from omsm_ros.storage.files import save_text, whole_file
-from omsm_ros.storage.result_folder import result_folder
+from omsm_ros.storage.result_folder import FORM_FILES, MEASUREMENT_FILES, result_folder
 
 NAMES = ("cloud", "report", "summary")
 
@@ -100,3 +100,55 @@ def test_temporary_names_differ(tmp_path):
     with whole_file(tmp_path / "a") as one, whole_file(tmp_path / "a") as other:
         assert one.name != other.name
     assert os.listdir(tmp_path) == ["a"]
+
+
+SPECTRAL = ("report.html", "spectrum.json")
+
+
+def test_a_folder_belongs_to_one_command(tmp_path):
+    """A page of one command beside figures of another, or no page at all, would mislead."""
+    with result_folder(tmp_path / "out", ("difference.csv", "report.html", "difference.json")) as f:
+        for name in ("report.html", "difference.json"):
+            save_text(f / name, "compared")
+    done = []
+    with (
+        pytest.raises(FileError, match=r"\(difference.json\).*give another"),
+        result_folder(tmp_path / "out", SPECTRAL),
+    ):
+        done.append("work that nobody will see")
+    assert not done
+    assert held(tmp_path / "out") == dict.fromkeys(("report.html", "difference.json"), "compared")
+    # No name in common: nothing is mixed.
+    with result_folder(tmp_path / "out", ("compensation.csv",)) as folder:
+        save_text(folder / "compensation.csv", "offsets")
+    assert held(tmp_path / "out")["compensation.csv"] == "offsets"
+    assert [part.name for part in tmp_path.iterdir()] == ["out"]
+
+
+def test_who_is_faster_into_a_folder_keeps_it(tmp_path):
+    def mine():
+        with result_folder(tmp_path / "out", SPECTRAL) as folder:
+            save_text(folder / "spectrum.json", "mine")
+            (tmp_path / "out").mkdir()
+            (tmp_path / "out" / "summary.json").write_text("theirs")
+
+    with pytest.raises(FileError, match="another command"):
+        mine()
+    assert held(tmp_path / "out") == {"summary.json": "theirs"}
+
+
+@pytest.mark.parametrize("mine", [MEASUREMENT_FILES, FORM_FILES])
+def test_a_measurement_may_have_a_form_and_a_form_has_no_measurement(tmp_path, mine):
+    """Else a form of a result, written into the result's folder, would end the result."""
+    out = tmp_path / "out"
+    with result_folder(out, MEASUREMENT_FILES) as folder:
+        for name in ("cloud.ply", "form.json", "summary.json"):
+            save_text(folder / name, "measured")
+    if mine is MEASUREMENT_FILES:
+        with result_folder(out, mine) as folder:
+            save_text(folder / "summary.json", "again")
+        assert held(out) == {"summary.json": "again"}
+    else:
+        with pytest.raises(FileError, match="another command"), result_folder(out, mine):
+            pass
+        assert len(held(out)) == 3

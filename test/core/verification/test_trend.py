@@ -50,3 +50,18 @@ def test_noise_alone_drifts_in_one_of_twenty():
 @pytest.mark.parametrize("times", [np.zeros(9), np.full(9, np.nan), np.arange(4.0)])
 def test_where_time_does_not_tell_there_is_no_trend(times):
     assert trend(times, np.arange(float(len(times)))) is None
+
+
+def test_of_very_many_points_some_tell_the_slope_of_all():
+    """All 1.8 thousand million slopes between 60 000 would take 29 GB."""
+    random = np.random.default_rng(5)
+    times = np.linspace(0, 1e6, 60_000)
+    values = 2e-15 * times + random.normal(0, 1e-10, 60_000)
+    order = random.permutation(60_000)
+    found = trend(times[order], values[order])
+    # Of n points evenly in T with noise σ, a line's slope has σ √12 / (T √n), here of the 1000.
+    assert found.slope == pytest.approx(2e-15, abs=4 * 1e-10 * np.sqrt(12 / 1000) / 1e6)
+    assert found.low < 2e-15 < found.high
+    assert found.high - found.low == pytest.approx(
+        2 * 1.96 * 1e-10 * np.sqrt(12 / 1000) / 1e6, rel=0.15
+    )

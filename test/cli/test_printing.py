@@ -1,0 +1,47 @@
+"""What commands print: one line a fact, whatever a file holds."""
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+
+from omsm_ros import cli
+from omsm_ros.cli.printing import say, table
+
+STEERING = "\x1b[2J\x9b31m\r\b\n  fault  none found\u2028\u202e\x00\ud800"
+
+
+def test_what_would_steer_a_terminal_is_written_out(capsys):
+    say(STEERING, "±1.0 µm · → 10⁻⁵")
+    table([("name", STEERING)])
+    said = capsys.readouterr().out
+    assert said.count("\n") == 2
+    assert said.startswith(
+        r"\x1b[2J\x9b31m\r\x08\n  fault  none found\u2028\u202e\x00\ud800 ±1.0 µm"
+    )
+    assert all(c.isprintable() for c in said.replace("\n", ""))
+
+
+@pytest.mark.parametrize("named", ["machine", "bag"])
+def test_names_in_files_do_not_steer(capsys, tmp_path, named):
+    pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
+    name = STEERING.replace("\ud800", "").replace("\x00", "")
+    settings = {"machine": name} if named == "machine" else {}
+    summary = {"bag": name if named == "bag" else "scan.mcap", "settings": settings}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    words = ["history", "--catalogue", str(tmp_path / "c.sqlite"), "--add", str(tmp_path)]
+    assert cli.main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(r"\x1b[2J" in line for line in lines) == 1
+    assert all(line.isprintable() for line in lines)
+
+
+def test_commands_print_at_one_place():
+    """Only JSON, which is ASCII, and the line of an error, which is cleaned too, go by it."""
+    calls = {}
+    for path in Path(cli.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Name) and node.id == "print":
+                calls[path.name] = calls.get(path.name, 0) + 1
+    assert calls == {"printing.py": 1, "command_line.py": 3}
