@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from typing import Any
 
@@ -10,6 +11,7 @@ from std_msgs.msg import String
 
 from omsm_ros import quantities
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.samples.recent import Flow
 from omsm_ros.core.spectra.running_spectrum import (
     AXES,
     CARRIAGE,
@@ -28,6 +30,8 @@ from omsm_ros.parameters import Parameter
 from omsm_ros.readable import quantity
 from omsm_ros.storage import conversions, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
+
+_SILENCE_S, _SILENCE_BLOCKS = 2.0, 5
 
 PARAMETERS = (
     Parameter("bands", "5 50 150 500 2000", "edges of the bands, rising [Hz]"),
@@ -64,6 +68,7 @@ class VibrationMonitorNode(ManagedNode):
         )
         self._alarm = Alarm(values["alarm"], values["release"])
         self._refused = ""
+        self._flow, self._block = Flow(), 0.0
         self._calibration: Calibration | None = None
         self._topic = CalibrationTopic(self, undo, self._use, listens=True)
         if path := values["calibration"]:
@@ -80,10 +85,12 @@ class VibrationMonitorNode(ManagedNode):
 
     def _take(self, message: Any, _: MessageInfo) -> None:
         try:
-            self._running.push(conversions.acceleration_block(message))
+            block = conversions.acceleration_block(message)
+            self._running.push(block)
         except OmsmError as err:
             self._refused = str(err)
             return
+        self._block = len(block) * block.sample_period
         levels = self._levels()
         was = self._alarm.raised
         if levels is not None and self._alarm.update(levels.total_effect) != was:
@@ -101,9 +108,12 @@ class VibrationMonitorNode(ManagedNode):
 
     def _line(self, levels: Any) -> str:
         axis, frequency, size = levels.line
+        line = f"{quantity(size, 'm/s²')} along {axis} at {quantity(frequency, 'Hz', 4)}"
+        if levels.height_line is None:
+            return f"strongest line {line}"
         return (
-            f"{quantity(levels.total_effect, 'm')} rms on a height, strongest "
-            f"{quantity(size, 'm/s²')} along {axis} at {quantity(frequency, 'Hz', 4)}"
+            f"{quantity(levels.total_effect, 'm')} rms on a height, most of it at "
+            f"{quantity(levels.height_line[0], 'Hz', 4)}; strongest line {line}"
         )
 
     def report(self) -> Report:
@@ -119,14 +129,24 @@ class VibrationMonitorNode(ManagedNode):
         else:
             report.message = self._line(levels)
             report.values.update(_figures(levels))
+            if self.values["mount"] == CARRIAGE and self._calibration is not None:
+                report.values["response_valid_up_to"] = self._calibration.valid_up_to
             if self._alarm.raised:
                 report.add(WARN, f"vibration beyond {quantity(self._alarm.limit, 'm')}: "
                                  f"{self._line(levels)}")  # fmt: skip
             if levels.effect is None:
                 report.add(WARN, "effect on a height not evaluated: no calibration yet")
+        self._add_silence(report, time.monotonic())
         if self._refused:
             report.add(WARN, f"a block was refused: {self._refused}")
         return report
+
+    def _add_silence(self, report: Report, now: float) -> None:
+        """Say that nothing comes: the levels are those of before."""
+        self._flow.update(self._running.received, now)
+        silent = self._flow.silent(now)
+        if silent is not None and silent > max(_SILENCE_S, _SILENCE_BLOCKS * self._block):
+            report.add(STALE, f"no acceleration for {silent:.0f} s; the levels are of before")
 
 
 def _figures(levels: Any) -> dict[str, object]:
@@ -140,6 +160,10 @@ def _figures(levels: Any) -> dict[str, object]:
             found[f"height_{band}"] = levels.effect[place]
     axis, frequency, size = levels.line
     found |= {"line_axis": axis, "line_frequency": frequency, "line_amplitude": size}
+    if levels.height_line is not None:
+        found |= dict(
+            zip(("height_line_frequency", "height_line_amplitude"), levels.height_line, strict=True)
+        )
     return found | {"height": levels.total_effect}
 
 

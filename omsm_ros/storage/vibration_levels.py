@@ -27,7 +27,11 @@ _SHAPE = {
     "alarm": {"type": "boolean"},
     "limit": _LEVEL,
 }
-_SCHEMA = form(_SHAPE, tuple(_SHAPE))
+_LINE_OF_HEIGHT = form(
+    dict.fromkeys(("frequency", "amplitude"), _LEVEL), ("frequency", "amplitude")
+)
+# Older recordings do not say what moves the height most.
+_SCHEMA = form({**_SHAPE, "height_line": _LINE_OF_HEIGHT}, tuple(_SHAPE))
 
 
 def vibration_levels(message: Any) -> dict[str, Any]:

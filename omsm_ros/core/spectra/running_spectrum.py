@@ -31,6 +31,7 @@ class VibrationLevels:
     line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
     effect: on a height, rms, one value a band [m]; None where it is not known
     total_effect: of all bands together [m];  windows: averaged so far
+    height_line: what moves the height most: frequency [Hz], amplitude [m]
     """
 
     bands: tuple[tuple[float, float], ...]
@@ -39,6 +40,7 @@ class VibrationLevels:
     effect: tuple[float, ...] | None
     total_effect: float | None
     windows: int
+    height_line: tuple[float, float] | None = None
 
     def entry(self) -> dict[str, Any]:
         """Return JSON values, in SI: ``height`` is the effect by band, ``height_total`` of all."""
@@ -50,7 +52,13 @@ class VibrationLevels:
             "height": None if self.effect is None else list(self.effect),
             "height_total": self.total_effect,
             "windows": self.windows,
-        }
+        } | self._height_line_entry()
+
+    def _height_line_entry(self) -> dict[str, Any]:
+        if self.height_line is None:
+            return {}
+        frequency, amplitude = self.height_line
+        return {"height_line": {"frequency": frequency, "amplitude": amplitude}}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,22 +157,22 @@ class RunningSpectrum:
         bands = tuple(
             pairwise([*edges, nyquist] if len(edges) < len(self.options.edges) else edges)
         )
-        effect = self._effect(bands, response)
+        height = self._height(response)
+        effect = None if height is None else _by_band(height, bands)
         return VibrationLevels(
             bands=bands,
-            rms={
-                axis: tuple(spectrum.power(*band) ** 0.5 for band in bands)
-                for axis, spectrum in self._mean.items()
-            },
-            line=self._strongest(bands),
+            rms={axis: _by_band(spectrum, bands) for axis, spectrum in self._mean.items()},
+            line=max(
+                ((axis, *_strongest(spectrum, bands)) for axis, spectrum in self._mean.items()),
+                key=lambda line: line[2],
+            ),
             effect=effect,
             total_effect=None if effect is None else float(np.sqrt(np.sum(np.square(effect)))),
             windows=self._windows,
+            height_line=None if height is None else _strongest(height, bands),
         )
 
-    def _effect(
-        self, bands: Sequence[tuple[float, float]], response: TransferFunction | None
-    ) -> tuple[float, ...] | None:
+    def _height(self, response: TransferFunction | None) -> Density | None:
         seen = self.options.mount == CARRIAGE
         if seen and response is None:
             return None
@@ -173,20 +181,25 @@ class RunningSpectrum:
         share = np.ones(len(omega))
         if seen and response is not None:
             share = np.abs(1 - response.response(spectrum.frequency))
-        height = Density(
+        return Density(
             spectrum.frequency, spectrum.density * (share / omega**2) ** 2, spectrum.step
         )
-        return tuple(height.power(*band) ** 0.5 for band in bands)
 
-    def _strongest(self, bands: Sequence[tuple[float, float]]) -> tuple[str, float, float]:
-        found = []
-        for axis, spectrum in self._mean.items():
-            inside = (spectrum.frequency >= bands[0][0]) & (spectrum.frequency <= bands[-1][1])
-            top = int(np.argmax(np.where(inside, spectrum.density, 0.0)))
-            at = float(spectrum.frequency[top])
-            near = spectrum.power(at - _LOBE * spectrum.step, at + _LOBE * spectrum.step)
-            found.append((axis, at, float(np.sqrt(2 * near))))
-        return max(found, key=lambda line: line[2])
+
+def _by_band(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[float, ...]:
+    """Return the rms by band. What lies on an edge counts once, in the band above it."""
+    inner = [np.nextafter(high, 0) for _, high in bands[:-1]] + [bands[-1][1]]
+    return tuple(
+        spectrum.power(low, high) ** 0.5 for (low, _), high in zip(bands, inner, strict=True)
+    )
+
+
+def _strongest(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return frequency and amplitude of the strongest line within the bands."""
+    inside = (spectrum.frequency >= bands[0][0]) & (spectrum.frequency <= bands[-1][1])
+    at = float(spectrum.frequency[np.argmax(np.where(inside, spectrum.density, 0.0))])
+    near = spectrum.power(at - _LOBE * spectrum.step, at + _LOBE * spectrum.step)
+    return at, float(np.sqrt(2 * near))
 
 
 @dataclass

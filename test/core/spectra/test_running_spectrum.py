@@ -67,6 +67,26 @@ def test_what_the_encoder_sees_moves_it_by_what_the_response_lacks(frequency):
     assert levels.total_effect == pytest.approx(moved * lacks / 2**0.5, rel=0.03)
 
 
+@pytest.mark.parametrize("frequency", [50.0, 150.0, 500.0])
+def test_a_line_on_the_edge_of_two_bands_counts_once(frequency):
+    """Mains at 50 Hz lies on an edge of the bands that are set by default."""
+    levels = fed(shaken(frequency, 10e-9 * (2 * np.pi * frequency) ** 2)).levels()
+    assert levels.total_effect == pytest.approx(10e-9 / 2**0.5, rel=0.01)
+    total = np.sqrt(np.sum(np.square(levels.rms["z"])))
+    assert total == pytest.approx(10e-9 * (2 * np.pi * frequency) ** 2 / 2**0.5, rel=1e-3)
+
+
+def test_what_moves_the_height_most_is_named_apart_from_what_shakes_most():
+    """3 nm at 40 Hz along z move it, 1 m/s² along x or at 1900 Hz hardly do."""
+    time = np.arange(12_000) / RATE
+    slow = 3e-9 * (2 * np.pi * 40) ** 2 * np.sin(2 * np.pi * 40 * time)
+    z = slow + 0.05 * np.sin(2 * np.pi * 1900 * time)
+    levels = fed(z).levels()
+    assert levels.line[:2] == ("z", pytest.approx(1900.0))
+    assert levels.height_line == (pytest.approx(40.0), pytest.approx(3e-9, rel=0.01))
+    assert fed(z, mount=CARRIAGE).levels().height_line is None
+
+
 def test_cut_anyhow_the_levels_are_the_same():
     z = shaken(123.0, 0.02) + np.random.default_rng(1).normal(0, 1e-3, 12_000)
     small, large = (RunningSpectrum(MonitorOptions()) for _ in range(2))
