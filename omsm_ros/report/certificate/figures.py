@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
@@ -167,7 +167,7 @@ def _draw_candidates(
     size = np.asarray([c["parameters"] for c in candidates])
     rms = np.asarray([c["rms_m"] for c in candidates]) / NANOMETRE_M
     if rms.max() > 3 * rms.min() > 0:
-        _plain_log(axes)
+        style.logarithmic(axes.yaxis, every=(1.0, 2.0, 5.0))
     axes.plot(size, rms, "o", color=style.MUTED, markersize=4, label="tried")
     best = int(np.argmin([c["bic"] for c in candidates]))
     axes.plot(
@@ -179,11 +179,3 @@ def _draw_candidates(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.legend_above(axes)
     style.label(axes, x="parameters of the dynamics", y="residual rms [nm]", title="Candidates")
-
-
-def _plain_log(axes: Axes) -> None:
-    """Label a logarithmic axis 1, 2, 5, 10."""
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())

@@ -31,7 +31,7 @@ def response(model: SampledModel) -> Figure:
     gain, spread = np.abs(value), np.exp(COVERAGE_FACTOR * np.minimum(band.gain, 5.0))
     upper.fill_between(frequency, gain / spread, gain * spread, **_SPAN)
     upper.plot(frequency, gain, color=style.AFTER, linewidth=1.6, label="identified")
-    upper.set_yscale("log")
+    style.logarithmic(upper.yaxis)
     # A band that is open somewhere must not flatten the curve.
     upper.set_ylim(0.3 * float(gain.min()), 3 * float(gain.max()))
     phase = np.unwrap(np.angle(value)) / DEGREE_RAD
@@ -39,7 +39,7 @@ def response(model: SampledModel) -> Figure:
     lower.fill_between(frequency, phase - off, phase + off, **_SPAN)
     lower.plot(frequency, phase, color=style.AFTER, linewidth=1.6)
     for axes_ in (upper, lower):
-        axes_.set_xscale("log")
+        style.logarithmic(axes_.xaxis, every=(1.0, 2.0, 5.0))
         axes_.set_xlim(frequency[0], frequency[-1])
         for low, high in ((frequency[0], model.valid_from), (model.valid_up_to, frequency[-1])):
             if high > low:

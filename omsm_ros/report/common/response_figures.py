@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, Band, response_band
@@ -114,7 +113,7 @@ def _draw_error(
         return np.maximum(error * _NM_PER_UM, _SMALLEST_SHOWN_NM_PER_UM)
 
     before = shown(np.abs(1 - reference))
-    axes.set_yscale("log")
+    style.logarithmic(axes.yaxis)
     axes.plot(frequency, before, color=style.BEFORE, linewidth=1.4, label="uncorrected")
     band = _band(identified, frequency)
     bound = COVERAGE_FACTOR * np.hypot(band.gain, band.phase) * np.abs(fitted)
@@ -148,9 +147,8 @@ def _draw_true(axes: Axes, frequency: FloatArray, value: FloatArray) -> None:
 
 
 def _frequency_axis(axes: Axes, frequency: FloatArray, identified: Calibration) -> None:
-    axes.set_xscale("log")
+    style.logarithmic(axes.xaxis, every=(1.0, 2.0, 5.0))
     axes.set_xlim(frequency[0], frequency[-1])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     if identified.valid_up_to < frequency[-1]:
         axes.axvspan(identified.valid_up_to, frequency[-1], color=style.MISSING, zorder=0)
         axes.axvline(identified.valid_up_to, color=style.MUTED, linewidth=0.8, linestyle=":")

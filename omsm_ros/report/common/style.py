@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -77,6 +80,21 @@ def quiet(axes: Axes) -> None:
         spine.set_linewidth(0.7)
     axes.grid(True, color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def logarithmic(axis: XAxis | YAxis, *, every: Sequence[float] = (1.0,)) -> None:
+    """Make an axis logarithmic, its numbers written as people read them: 0.1, 1, 10.
+
+    every: the multiples of each power of ten that get a tick and a number
+
+    Powers as 10⁻¹ would need matplotlib's formula language, which takes longer to load than the
+    figure to draw.
+    """
+    scale = axis.axes.set_xscale if isinstance(axis, XAxis) else axis.axes.set_yscale
+    scale("log", nonpositive="clip")
+    axis.set_major_locator(LogLocator(subs=every))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def label(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:

@@ -24,6 +24,7 @@ def chirp(time: FloatArray, check: PathCheck, model_lag: FloatArray) -> Figure:
         axes[0, 0].fill_between(at, low, high, color=colour, alpha=0.7, label=name, linewidth=0)
     style.label(axes[0, 0], x="time [s]", y="nm", title="Error on the free path")
     style.legend_above(axes[0, 0])
+    style.logarithmic(axes[1, 0].yaxis)
     middle = np.array([(low + high) / 2 for low, high in check.excited])
     for errors, lags, colour, name in (
         (check.error_before, check.lag_before, style.BEFORE, "before"),
@@ -32,7 +33,7 @@ def chirp(time: FloatArray, check: PathCheck, model_lag: FloatArray) -> Figure:
         inside = [_inside(check, band) for band in check.excited]
         rms = [np.sqrt(np.mean(errors[k] ** 2)) / NANOMETRE_M for k in inside]
         lag = [np.mean(lags[k]) / DEGREE_RAD for k in inside]
-        axes[1, 0].semilogy(middle, rms, "o-", color=colour, markersize=3.5, label=name)
+        axes[1, 0].plot(middle, rms, "o-", color=colour, markersize=3.5, label=name)
         axes[2, 0].plot(middle, lag, "o-", color=colour, markersize=3.5, label=name)
     axes[2, 0].plot(middle, model_lag / DEGREE_RAD, "--", color=style.TRUTH, label="true response")
     style.label(axes[1, 0], x="frequency [Hz]", y="nm rms", title="Amplitude error by frequency")

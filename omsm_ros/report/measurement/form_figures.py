@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.report.common import style
@@ -95,11 +94,8 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
     values = np.array(curve["value"], np.float64)
     floor = max(_BELOW * float(values.min()), _LEAST_SHARE * float(values.max()))
     _draw(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
-    ax.set_xscale("log")
-    ax.set_yscale("log", nonpositive="clip")
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
+    style.logarithmic(ax.xaxis, every=(1.0, 2.0, 5.0))
+    style.logarithmic(ax.yaxis)
     style.label(
         ax,
         x="spatial frequency [1/mm]",

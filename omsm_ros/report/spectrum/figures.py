@@ -79,7 +79,9 @@ def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) ->
     frequency, level = smoothed(spectrum)
     place = 1 / frequency / unit if over else frequency
     height = np.sqrt(level / MILLIMETRE_M if over else level) / NANOMETRE_M
-    axes.loglog(place, height, color=style.MUTED, linewidth=0.8)
+    style.logarithmic(axes.xaxis)
+    style.logarithmic(axes.yaxis)
+    axes.plot(place, height, color=style.MUTED, linewidth=0.8)
 
 
 def _marks(axes: Axes, named: Sequence[Named], coordinate: str, unit: float, extent: float) -> None:
@@ -106,10 +108,12 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
     """Draw the density of the path's own motion against the calibrated band (Fig. 7c)."""
     made, axes = style.figure(_WIDTH_IN, 3.0)
     one = axes[0, 0]
+    style.logarithmic(one.xaxis)
+    style.logarithmic(one.yaxis)
     for k, (name, spectrum) in enumerate(spectra):
         frequency, level = smoothed(spectrum)
         colour = list(COLOURS.values())[k % len(COLOURS)]
-        one.loglog(frequency, np.sqrt(level) / NANOMETRE_M, linewidth=0.9, color=colour, label=name)
+        one.plot(frequency, np.sqrt(level) / NANOMETRE_M, linewidth=0.9, color=colour, label=name)
     if valid_up_to is not None:
         top = max(float(s.frequency[-1]) for _, s in spectra)
         one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")
@@ -134,7 +138,7 @@ def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | N
                 one.plot(
                     [at, at], [level - 0.35, level + 0.35], color=COLOURS[row.kind], linewidth=1.6
                 )
-    one.set_xscale("log")
+    style.logarithmic(one.xaxis)
     one.set_yticks(range(len(scans)), [studied.signal.name for studied, _ in scans])
     one.invert_yaxis()
     style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")
