@@ -68,6 +68,19 @@ def test_the_feed_over_a_round_part_holds_no_frequency_and_its_swing_does(noise)
     assert content_frequency(toric + scatter, PERIOD) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.parametrize("turns", [1, 2, 4, 32])
+def test_of_few_turns_the_content_is_that_of_many(turns):
+    """Heights over a circle are a Fourier series: three waves a turn hold 99.9 % of its swing."""
+    angle = 2 * np.pi * np.arange(4096) / 4096
+    height = PAPER_MIRROR.height(12.7e-3 * np.cos(angle), 12.7e-3 * np.sin(angle))
+    swing = np.cumsum(np.abs(np.fft.rfft(height) * np.arange(2049)) ** 2)
+    waves = int(np.argmax(swing >= 0.999 * swing[-1]))
+    assert waves == 3
+    time = np.arange(turns * 2000) * PERIOD  # a turn takes 2 s
+    z = Spiral(PAPER_MIRROR, 12.7e-3, 1e-4, 30.0).positions(time).z
+    assert content_frequency(z, PERIOD) == pytest.approx(0.5 * waves, abs=0.26)
+
+
 @pytest.mark.parametrize("servo", [50.0, 200.0])
 @pytest.mark.parametrize("factor", [1.0, 7.0])
 def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: float) -> None:
