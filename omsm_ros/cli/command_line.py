@@ -21,6 +21,7 @@ from omsm_ros.cli.at_work import at_work
 from omsm_ros.cli.printing import say, say_lines
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
+from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_json
 
 if TYPE_CHECKING:  # it would load what reads bags, for a list of words
@@ -183,7 +184,7 @@ def _unforeseen(err: Exception) -> int:
     """Say what nobody foresaw; return the exit status."""
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _OF_A_DISK):
         # Of a place that the system refuses: a name too long, no permission, a broken disk.
-        path = "a file" if err.filename is None else quantities.shown(os.fsdecode(err.filename))
+        path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))
         _complain(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
     _complain(defect(err))
@@ -191,12 +192,12 @@ def _unforeseen(err: Exception) -> int:
 
 
 def _check_words(given: list[str]) -> None:
-    """Raise ConfigurationError for a word that ends in the middle, as no name of a file does."""
+    """Raise ConfigurationError for a word that ends in the middle, or an option without a value."""
     for word in given:
+        if word.startswith("--") and word.endswith("=--"):  # argparse takes it for an empty list
+            raise ConfigurationError(f"option {shown(word)} has no value; give one")
         if "\0" in word:
-            raise ConfigurationError(
-                f"argument {quantities.shown(word)} holds a null character; leave it out"
-            )
+            raise ConfigurationError(f"argument {shown(word)} holds a null character; leave it out")
 
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:

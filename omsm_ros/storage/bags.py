@@ -20,6 +20,7 @@ from rosbags.rosbag2 import Reader
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError, DataError
+from omsm_ros.quantities import shown
 from omsm_ros.storage import conversions
 from omsm_ros.storage.bag_checks import (
     DAMAGED,
@@ -270,6 +271,11 @@ class BagReader:
             if connections:
                 for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
                     promised -= 1
+                    if not isinstance(raw, bytes | memoryview):  # SQLite keeps any in any column
+                        raise BagError(
+                            f"bag {str(self.path)!r}: a message is {shown(raw)}, no bytes: "
+                            f"{DAMAGED}"
+                        )
                     yield connection, stamp, unpacked_message(raw) if self._compressed else raw
         if promised and start_ns is None and stop_ns is None:
             more_or_less = "fewer" if promised > 0 else "more"

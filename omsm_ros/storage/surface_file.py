@@ -87,7 +87,10 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
         units = units_of(values["unit"]) if "unit" in values else None
         grid = as_grid(read_points(folder / values["file"], units))
         if grid is None:
-            raise DataError("its points are no evenly spaced rows and columns")
+            raise DataError(
+                "its points are no evenly spaced rows and columns; make such a map of them with "
+                "'omsm export --spacing'"
+            )
         return GridSurface(grid)
     except (FileError, DataError) as err:
         raise SurfaceError(f"{what}: {err}") from err

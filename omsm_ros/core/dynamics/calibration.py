@@ -153,7 +153,8 @@ class Calibration:
             settings=content["settings"],
             certificate=content["certificate"],
         )
-        plausibility.check_covariance(calibration.covariance, dynamics, calibration.valid_up_to)
+        for covariance in (calibration.covariance, calibration.noise_covariance):
+            plausibility.check_covariance(covariance, dynamics, calibration.valid_up_to)
         return calibration
 
     @cached_property

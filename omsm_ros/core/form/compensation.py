@@ -70,6 +70,11 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
             f"low-pass of {low_pass!r} m is finer than the points resolve, expected "
             f"{_LEAST_CELLS * cells.pitch!r} m or more; measure more points, or compensate less"
         )
+    if min(len(cells.x), len(cells.y)) < 2:
+        raise DataError(
+            f"the points lie within one row of cells of {cells.pitch!r} m, where nothing is known "
+            "across it; measure more tracks"
+        )
     smooth = cells.smoothed(np.concatenate([[cells.mean], cells.effects]), low_pass)
     # Noise of the cells, averaged by the filter: its square by the square of the weights.
     averaged = np.sqrt(cells.smoothed_square(cells.noise**2, low_pass))

@@ -41,6 +41,8 @@ _RADIUS_KNOWN = 2e-4
 _CERTAIN = 5.0
 # With less than this a slope of the beam moves no point by a nanometre.
 _USEFUL_DISTANCE_M = 2e-6
+# Singular values below this part of the largest are rounding.
+_SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -284,6 +286,11 @@ def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> Float
     # condition number, and with it lose what is barely known.
     unit, scale = unit_columns(jacobian)
     _, values, rows = np.linalg.svd(unit, full_matrices=False)
+    if values[-1] <= _SINGULAR * values[0]:
+        raise DataError(
+            "the scan does not show where the spindle's centre lies: the probe hardly moved over "
+            "the sphere; scan across it while the spindle turns"
+        )
     root = rows.T / values / scale[:, np.newaxis]
     inverse = root @ root.T
     edges = np.arange(0, len(residual), _GROUP_POINTS)

@@ -89,8 +89,6 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
             f"{int(np.sum(used))!r} samples are used, at least {2 * LEAST_SAMPLES} are needed, "
             "and a finite input everywhere"
         )
-    if np.ptp(input) == 0:
-        raise IdentificationError("the input never changes; excite it while recording")
     samples = len(input)
     moving = np.ones(samples, np.bool_)
     # In units of its own spread, as a machine's motion is of its travel.

@@ -128,6 +128,7 @@ class ColumnMap:
             raise DataError("neither sample_period nor a column of time; give one of them")
         if self.sample_period is not None:
             SAMPLE_PERIOD.checked(self.sample_period, DataError, "sample_period")
+        TIME.checked(self.start, DataError, "start")  # else it has no number of nanoseconds
         STAMP.checked(round(self.start * NANOSECONDS_PER_S), DataError, "start")
         if self.start and self.dated:
             raise DataError(
@@ -136,9 +137,11 @@ class ColumnMap:
         if not {"z", "distance"} & set(self.columns):
             raise DataError("neither z nor distance has a column; write one of them into the map")
         lacking = [a for a in AXES if a not in self.columns]
-        if "z" in self.columns and lacking:
+        read = [a for a in AXES if self.has(a)]
+        if lacking and (read or "z" in self.columns):
             raise DataError(
-                f"no column for {', '.join(lacking)}, which z needs beside it; where one stood "
+                f"no column for {', '.join(lacking)}, which {(read or ['z'])[-1]} needs beside it; "
+                "where one stood "
                 f"still, write {', '.join(f'{axis}: {{constant: 0}}' for axis in lacking)}"
             )
 
