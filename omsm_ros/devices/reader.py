@@ -56,10 +56,11 @@ class DeviceReader:
         device: Readable,
         deliver: Callable[[Sequence[BlockPair]], None],
         note: Callable[[str], None] = lambda _: None,
+        complain: Callable[[str], None] = lambda _: None,
         back_off: tuple[float, float] = BACK_OFF_S,
         connected: Callable[[], None] = lambda: None,
     ) -> None:
-        """note: called once for each new trouble, and when it is over
+        """complain, note: called once for each new trouble, and when it is over
         connected: called when the device was set up, before its samples are delivered
         """
         self.state = State.CONNECTING
@@ -67,7 +68,7 @@ class DeviceReader:
         self.connections = 0
         self._device = device
         self._deliver = deliver
-        self._note = note
+        self._note, self._complain = note, complain
         self._back_off = back_off
         self._when_connected = connected
         self._unproven = False
@@ -127,11 +128,11 @@ class DeviceReader:
                 self._hand_over(blocks)
         except (DeviceError, ConfigurationError) as err:
             self._unproven = isinstance(err, NoSamplesError)
+            self.state = State.LOST
             self._tell(str(err))
-            self.state = State.LOST
         except Exception as err:  # a defect of ours must not end the reading for good
-            self._tell(defect(err))
             self.state = State.LOST
+            self._tell(defect(err))
         self._let_go()
         return any_came
 
@@ -160,4 +161,9 @@ class DeviceReader:
     def _tell(self, trouble: str) -> None:
         if trouble != self.trouble:
             self.trouble = trouble
-            self._note(f"{trouble}; trying again" if trouble else "connected and set up")
+            if not trouble:
+                self._note("connected and set up")
+            elif self.state is State.READING:
+                self._complain(trouble)
+            else:
+                self._complain(f"{trouble}; trying again")

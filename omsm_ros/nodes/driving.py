@@ -70,6 +70,7 @@ class DriverNode(ManagedNode):
             self._device,
             self._publish,
             self.get_logger().info,
+            self.get_logger().warning,
             connected=self._tell_settings,
         )
         self._recent, self._flow = RecentIncrease(), Flow()

@@ -48,7 +48,9 @@ def run(
     notes: list[str] = []
     got: list[BlockPair] = []
     device = Scripted(stop, opens, polls)
-    reader = DeviceReader(device, got.extend, notes.append, back_off=(1e-3, 4e-3))
+    reader = DeviceReader(
+        device, got.extend, notes.append, lambda text: notes.append(f"! {text}"), (1e-3, 4e-3)
+    )
     reader.run(stop)
     assert device.closed >= 1
     assert reader.state is State.ENDED
@@ -68,9 +70,9 @@ def test_it_connects_again_and_tells_each_trouble_once() -> None:
     assert len(got) == 2
     assert reader.connections == 2
     assert notes == [
-        "gone; trying again",
+        "! gone; trying again",
         "connected and set up",
-        "lost; trying again",
+        "! lost; trying again",
         "connected and set up",
     ]
 
@@ -78,9 +80,9 @@ def test_it_connects_again_and_tells_each_trouble_once() -> None:
 def test_that_nothing_can_be_read_stays_until_samples_come() -> None:
     mute = NoSamplesError("mute")
     reader, notes, _ = run([[], [], []], [mute, [], mute, [], [BLOCK]])
-    assert notes == ["connected and set up", "mute; trying again", "connected and set up"]
+    assert notes == ["connected and set up", "! mute; trying again", "connected and set up"]
     reader, notes, _ = run([[], []], [[BLOCK], mute])
-    assert notes[-1] == "mute; trying again"
+    assert notes[-1] == "! mute; trying again"
     assert reader.trouble == "mute"
 
 
@@ -95,9 +97,12 @@ def test_the_device_own_trouble_is_passed_on() -> None:
     stop = threading.Event()
     device = Scripted(stop, [[]], [[BLOCK]])
     device.trouble = "measures at 900 Hz"
-    reader = DeviceReader(device, lambda _: None)
+    complaints: list[str] = []
+    reader = DeviceReader(device, lambda _: None, complain=complaints.append)
     reader.run(stop)
     assert reader.trouble == "measures at 900 Hz"
+    # It reads on: nothing is tried again.
+    assert complaints == ["measures at 900 Hz"]
 
 
 def test_a_stop_ends_a_long_pause_at_once() -> None:
