@@ -10,7 +10,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, cell_of, number
 from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.measuring import CALIBRATION, geometry_of
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.jobs.study_scans import alignment_of
 from omsm_ros.readable import measured, quantity
 from omsm_ros.storage.calibration_file import load_calibration
@@ -72,7 +72,7 @@ def _show_align(facts: Facts) -> None:
         )
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
-    table([*rows, ("written to", facts["file"])])
+    table([*rows, written([facts["file"]])])
 
 
 COMMANDS = (Command("align", _declare_align, _align, _show_align),)

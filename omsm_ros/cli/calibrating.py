@@ -20,7 +20,7 @@ from omsm_ros.cli.arguments import (
     trigger_of,
 )
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
-from omsm_ros.cli.printing import say, say_lines, table
+from omsm_ros.cli.printing import say, say_lines, table, written
 from omsm_ros.core.correction.calibration_set import calibration_set
 from omsm_ros.core.dynamics.calibration import verdict_of
 from omsm_ros.core.machine.step_plan import (
@@ -183,7 +183,7 @@ def _show_plan(facts: Facts) -> None:
             ("travel", _lengths([facts["travel"]])),
             ("duration", quantity(facts["duration"], "s")),
             ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
-            ("written", ", ".join(facts["files"].values())),
+            written(facts["files"].values()),
         ]
     )
 
@@ -240,7 +240,7 @@ def _show_calset(facts: Facts) -> None:
             ),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
             ("verdict", facts["verdict"] or "none"),
-            ("written to", facts["calibration"]),
+            written([facts["calibration"]]),
         ]
     )
 

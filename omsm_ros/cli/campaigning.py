@@ -12,7 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.catalogue_option import ADDRESS, declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar
-from omsm_ros.cli.printing import say
+from omsm_ros.cli.printing import say, table, written
 from omsm_ros.jobs.run_campaign import DONE, Entry, load_summary, run_campaign
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import REPORT, save_text
@@ -81,7 +81,8 @@ def _show_batch(facts: Facts) -> None:
         if entry["state"] != DONE:
             say(f"{entry['bag']}: {entry['state']}, {entry['said']}")
     done = sum(entry["state"] == DONE for entry in facts["entries"])
-    say(f"{done} of {len(facts['entries'])} bags are done; see {facts['out']}/{_INDEX}")
+    say(f"{done} of {len(facts['entries'])} bags are done")
+    table([written([_INDEX], facts["out"])])
 
 
 def _undone(facts: Facts) -> str:

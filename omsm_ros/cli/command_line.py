@@ -18,7 +18,7 @@ from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
-from omsm_ros.cli.printing import say, say_lines
+from omsm_ros.cli.printing import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
 from omsm_ros.quantities import shown
@@ -129,7 +129,7 @@ def _experiment(args: argparse.Namespace) -> int:
         return DONE
     for row in facts["compared"]:
         say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
-    say(f"written: {args.out / 'report.html'}")
+    table([written(["report.html"], str(args.out))])
     return DONE
 
 

@@ -9,7 +9,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
 from omsm_ros.cli.command import Command, Facts
 from omsm_ros.cli.fit_option import freedoms
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.compare_measurements import (
@@ -92,7 +92,8 @@ def _difference(args: argparse.Namespace) -> Facts:
     found, facts = compare_measurements(args.a, args.b, options, nominal)
     with result_folder(args.out, (MAP, REPORT, DIFFERENCE)) as out:
         write_difference(out, found, facts)
-    return {**facts, "files": {"difference": DIFFERENCE, "map": MAP, "report": REPORT}}
+    files = {"difference": DIFFERENCE, "map": MAP, "report": REPORT}
+    return {**facts, "files": files, "out": str(args.out)}
 
 
 def _show_difference(facts: Facts) -> None:
@@ -121,7 +122,7 @@ def _show_difference(facts: Facts) -> None:
         rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
     for name in ("a", "b"):
         rows += [(f"note on {name.upper()}", text) for text in facts[name]["notes"]]
-    table([*rows, ("written", ", ".join(facts["files"].values()))])
+    table([*rows, written(facts["files"].values(), facts["out"])])
 
 
 def _length(value: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
 from omsm_ros.cli.command import Command, Facts
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.jobs.export_points import export
 from omsm_ros.readable import count, quantity
 
@@ -42,7 +42,7 @@ def _show_export(facts: Facts) -> None:
             ("resampling", facts["resampling"]),
             ("its error", f"at most {quantity(facts['interpolation_error'], 'm', 2)} rms"),
         ]  # fmt: skip
-    table([*rows, ("written", facts["file"])])
+    table([*rows, written([facts["file"]])])
 
 
 COMMANDS = (Command("export", _declare_export, _export, _show_export),)

@@ -9,14 +9,14 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, add_bags, cell_of, number, refuse_cell
 from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.core.machine.limits import MachineLimits
 from omsm_ros.core.registration.freedoms import AUTO
 from omsm_ros.jobs.compensate_form import COMPENSATION, PATH, compensate_form
 from omsm_ros.jobs.judge_form import draw_form, judge_form
 from omsm_ros.jobs.measured_portions import open_measurement
 from omsm_ros.jobs.show_surface import Scan, show_surface
-from omsm_ros.readable import plain, quantity
+from omsm_ros.readable import count, plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, REPORT
 from omsm_ros.storage.machine_files import load_limits
@@ -63,15 +63,15 @@ def _form(args: argparse.Namespace) -> Facts:
         if not args.no_report:
             draw_form(source, out)
             facts = {**facts, "report": REPORT}
-        return facts
+    return {**facts, "out": str(args.out)}
 
 
 def _show_form(facts: Facts) -> None:
     verdict = []
     if held := facts.get("conformity"):
         verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
-    written = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
-    table([*verdict, *form_rows(facts), ("written", ", ".join(written))])
+    files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
+    table([*verdict, *form_rows(facts), written(files, facts["out"])])
 
 
 def _declare_compensate(sub: argparse.ArgumentParser) -> None:
@@ -103,7 +103,10 @@ def _compensate(args: argparse.Namespace) -> Facts:
     spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
     with result_folder(args.out, (COMPENSATION, PATH)) as out:
         points = open_measurement(args.measured, args.unit)
-        return compensate_form(points, surface, out, args.low_pass, args.fit, args.aperture, spiral)
+        facts = compensate_form(
+            points, surface, out, args.low_pass, args.fit, args.aperture, spiral
+        )
+    return {**facts, "out": str(args.out)}
 
 
 def _show_compensate(facts: Facts) -> None:
@@ -111,11 +114,12 @@ def _show_compensate(facts: Facts) -> None:
     rows = [(name.replace("_", " "), quantity(facts[name], "m")) for name in lengths]
     rows += [("warning", text) for text in facts["warnings"]]
     rows += [("not evaluated", text) for text in facts["not_evaluated"]]
+    rows.append(("places", count(facts["places"])))
+    files = [facts["file"]]
     if "path" in facts:
-        rows += [("along the spiral", f"{facts['path']}, {facts['path_places']} places")]
-    table(
-        [*rows, ("sign", facts["sign"]), ("written", f"{facts['file']}, {facts['places']} places")]
-    )
+        rows.append(("along the spiral", count(facts["path_places"])))
+        files.append(facts["path"])
+    table([*rows, ("sign", facts["sign"]), written(files, facts["out"])])
 
 
 def _declare_surface(sub: argparse.ArgumentParser) -> None:
@@ -136,7 +140,8 @@ def _surface(args: argparse.Namespace) -> Facts:
     limits = load_limits(args.limits) if args.limits else MachineLimits()
     scan = Scan(args.radius, args.feed, args.rpm)
     facts = show_surface(load_surface(args.surface), scan, limits, args.probe_angle, args.out)
-    return {"surface": str(args.surface), **facts}
+    where = {"out": str(args.out)} if args.out is not None else {}
+    return {"surface": str(args.surface), **facts, **where}
 
 
 _FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
@@ -145,7 +150,7 @@ _FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
 def _show_surface(facts: Facts) -> None:
     x, y = (quantity(part, "m") for part in facts["steepest_at"])
     angle = f"{plain(facts['steepest_angle'] / DEGREE_RAD)}°"
-    written = [("written", facts["figure"])] if "figure" in facts else []
+    drawn = [written([facts["figure"]], facts["out"])] if "figure" in facts else []
     table(
         [
             ("peak to valley", quantity(facts["peak_to_valley"], "m")),
@@ -155,7 +160,7 @@ def _show_surface(facts: Facts) -> None:
             *((f"  {limit['name']}", f"{quantity(limit['value'], limit['unit'])} of "
                f"{quantity(limit['allowed'], limit['unit'])}") for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"])),
-            *written,
+            *drawn,
         ]
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ from omsm_ros.cli.arguments import (
 )
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.sampled.identify_samples import HOLDS
@@ -218,7 +218,7 @@ def _show(facts: Facts) -> None:
         ]
     for kind in ("reasons", "reservations", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts.get(kind, [])]
-    rows.append(("written to", facts.get("calibration") or facts["model"]))
+    rows.append(written([facts.get("calibration") or facts["model"]]))
     if "report" in facts:
         rows.append(("certificate", facts["report"]))
     table(rows)

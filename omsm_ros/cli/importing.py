@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from omsm_ros.cli.command import Command, Facts, progress_bar
-from omsm_ros.cli.printing import say
+from omsm_ros.cli.printing import say, table, written
 from omsm_ros.jobs.import_recording import import_recording
 from omsm_ros.storage.column_map_file import load_column_map
 
@@ -21,9 +21,9 @@ def _declare_import(sub: argparse.ArgumentParser) -> None:
 
 
 def _import(args: argparse.Namespace) -> Facts:
-    mapped, written = load_column_map(args.map)
+    mapped, form = load_column_map(args.map)
     with progress_bar("importing", args.json, " samples") as progress:
-        found = import_recording(args.files, mapped, written, args.out, progress)
+        found = import_recording(args.files, mapped, form, args.out, progress)
     return {"bag": str(args.out), "files": [asdict(file) for file in found]}
 
 
@@ -42,7 +42,7 @@ def _show_import(facts: Facts) -> None:
                 say(f"    {meaning}: {file[count]}")
     if any(file["own_clock"] for file in facts["files"]):
         say("probe and axes have clocks of their own: identify and correct with --by-stamps")
-    say(f"written: {facts['bag']}; look at it with 'omsm inspect'")
+    table([written([facts["bag"]]), ("next", "look at it with 'omsm inspect'")])
 
 
 COMMANDS = (Command("import", _declare_import, _import, _show_import),)

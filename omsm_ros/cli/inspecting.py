@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omsm_ros.cli.arguments import add_bags, cell_of
 from omsm_ros.cli.command import Command, Facts, progress_bar
-from omsm_ros.cli.printing import say, table
+from omsm_ros.cli.printing import say, table, written
 from omsm_ros.jobs.inspect_bag import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
@@ -45,7 +45,7 @@ def _show(facts: Facts) -> None:
     if "repaired" in facts:
         saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
         lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
-        table([("written", facts["repaired"]), *saved, *lost])
+        table([written([facts["repaired"]]), *saved, *lost])
         return
     row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
     names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")

@@ -23,7 +23,7 @@ from omsm_ros.cli.arguments import (
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
@@ -160,7 +160,8 @@ def _correct(args: argparse.Namespace) -> Facts:
             progress=progress,
         )
     warnings = remembered(args.catalogue, lambda: _keep(args))
-    return {**summary, "warnings": [*summary["warnings"], *warnings]}
+    warnings = [*summary["warnings"], *warnings]
+    return {**summary, "warnings": warnings, "out": str(args.out)}
 
 
 def _keep(args: argparse.Namespace) -> bool:
@@ -181,7 +182,7 @@ def _show_correct(summary: Facts) -> None:
     rows += [("warning", text) for text in summary.get("warnings", [])]
     if "form" in summary:
         rows += form_rows(summary["form"])
-    table([*rows, ("written", ", ".join(summary["files"].values()))])
+    table([*rows, written(summary["files"].values(), summary["out"])])
 
 
 def _declare_predict(sub: argparse.ArgumentParser) -> None:

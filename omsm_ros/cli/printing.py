@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from omsm_ros.errors import printable
 
 
@@ -14,6 +16,12 @@ def say_lines(text: str) -> None:
     """Print a text of ours that has several lines."""
     for line in text.split("\n"):
         say(line)
+
+
+def written(files: Iterable[str], folder: str = "") -> tuple[str, str]:
+    """Return the row of a table that says what was written: names and their folder, or paths."""
+    names = ", ".join(files)
+    return "written", f"{names} in {folder}" if folder else names
 
 
 def table(rows: list[tuple[str, str]]) -> None:

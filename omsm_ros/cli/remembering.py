@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from omsm_ros.cli.catalogue_option import declare_catalogue
 from omsm_ros.cli.command import Command, Facts
-from omsm_ros.cli.printing import say, table
+from omsm_ros.cli.printing import say, table, written
 from omsm_ros.core.verification.trend import Trend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
@@ -108,7 +108,7 @@ def _show_history(facts: Facts) -> None:
             "nor in the drifts; --machine lists one machine"
         )
     if "figure" in facts:
-        say(f"written: {facts['figure']}")
+        table([written([facts["figure"]])])
 
 
 def _when(row: dict[str, Any]) -> str:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros.cli.command import Command, Facts
-from omsm_ros.cli.printing import say
+from omsm_ros.cli.printing import table, written
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.surface_file import load_surface
 
@@ -29,7 +29,7 @@ def _report(args: argparse.Namespace) -> Facts:
 
 
 def _show_report(facts: Facts) -> None:
-    say(f"written: {facts['report']}")
+    table([written([facts["report"]])])
 
 
 COMMANDS = (Command("report", _declare_report, _report, _show_report),)

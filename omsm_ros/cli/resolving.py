@@ -10,7 +10,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
 from omsm_ros.cli.measuring import CALIBRATION
-from omsm_ros.cli.printing import table
+from omsm_ros.cli.printing import table, written
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
 from omsm_ros.core.verification.resolved_calibration import undetermined
@@ -122,7 +122,7 @@ def _show_selfcal(facts: Facts) -> None:
             ("left on this surface", f"{quantity(facts['left_on_this_surface'], 'm')} rms (k = 1)"),
             ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
             *(("not determined", text) for text in facts["not_told"]),
-            ("written to", facts["calibration"]),
+            written([facts["calibration"]]),
         ]
     )  # fmt: skip
 
@@ -178,7 +178,7 @@ def _show_reversal(facts: Facts) -> None:
             ("meaning", _MEANINGS[facts["latency"]]),
             ("residual", f"{quantity(facts['residual'], 'm')} rms"),
             ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
-            ("written to", facts.get("calibration", "nowhere; give --out to use it")),
+            written([facts.get("calibration", "nowhere; give --out to use it")]),
         ]
     )
 
@@ -206,7 +206,7 @@ def _show_latency(facts: Facts) -> None:
         [
             ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
             *_latency_rows(facts["latency"]),
-            ("written to", facts["calibration"]),
+            written([facts["calibration"]]),
         ]
     )
 

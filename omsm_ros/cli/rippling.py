@@ -8,7 +8,7 @@ from pathlib import Path
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
 from omsm_ros.cli.command import Command, Facts, progress_bar
-from omsm_ros.cli.printing import say, table
+from omsm_ros.cli.printing import say, table, written
 from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.readable import plain, quantity
 from omsm_ros.storage.calibration_file import load_calibration
@@ -50,9 +50,10 @@ def _spectrum(args: argparse.Namespace) -> Facts:
     )
     with progress_bar("reading", args.json) as progress:
         bags = [cell_of(path, args) for path in args.scans]
-        return publish_spectra(
+        facts = publish_spectra(
             bags, options, args.out, report=not args.no_report, progress=progress
         )
+    return {**facts, "out": str(args.out)}
 
 
 def _show_spectrum(facts: Facts) -> None:
@@ -63,7 +64,7 @@ def _show_spectrum(facts: Facts) -> None:
         if stopped := scan["band_stop"]:
             say(f"band stop, no phase: {quantity(stopped['rms_before'], 'm')} → "
                   f"{quantity(stopped['rms_after'], 'm')} rms")  # fmt: skip
-    say(f"written: {', '.join(facts['files'].values())}")
+    table([written(facts["files"].values(), facts["out"])])
 
 
 def _peak_row(peak: Facts) -> tuple[str, str]:

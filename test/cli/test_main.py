@@ -58,6 +58,7 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     )  # fmt: skip
     assert status == 0
     summary = json.loads(text)
+    assert summary.pop("out") == str(tmp_path)
     assert summary == json.loads((tmp_path / "summary.json").read_text())
     for account in summary["samples"].values():
         assert account["received"] == 40_000

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+import omsm_ros
 from omsm_ros import cli
 from omsm_ros.cli.printing import say, table
+
+from .written import write
 
 STEERING = "\x1b[2J\x9b31m\r\b\n  fault  none found\u2028\u202e\x00\ud800"
 
@@ -45,3 +48,26 @@ def test_commands_print_at_one_place():
             if isinstance(node, ast.Name) and node.id == "print":
                 calls[path.name] = calls.get(path.name, 0) + 1
     assert calls == {"printing.py": 1, "command_line.py": 3}
+
+
+def test_what_is_written_is_where_the_line_says(capsys, small_scan, calibration, tmp_path):
+    """One way for all commands: names and their folder, or paths."""
+    scan = write(tmp_path / "scan.mcap", small_scan)
+    nominal = Path(omsm_ros.__file__).parent.parent / "config" / "paper_mirror.yaml"
+    result, surface = tmp_path / "result", tmp_path / "look"
+    for arguments, expected in (
+        (["correct", scan, "--calibration", calibration, "--no-report",
+          "--out", result], f"cloud.ply, summary.json in {result}"),
+        (["report", result, "--calibration", calibration], f"{result}/report.html"),
+        (["form", result, "--nominal", nominal, "--no-report", "--out", tmp_path / "form"],
+         f"form.json, curves.json, deviation.ply in {tmp_path}/form"),
+        (["surface", "show", nominal, "--radius", "0.002", "--out", surface],
+         f"surface.png in {surface}"),
+        (["plan", "steps", "--out", tmp_path], f"{tmp_path}/steps.csv, {tmp_path}/steps.nc"),
+    ):  # fmt: skip
+        assert cli.main([str(argument) for argument in arguments]) == 0
+        text = capsys.readouterr().out
+        (said,) = [line.split(None, 1)[1] for line in text.splitlines() if "written" in line]
+        assert said == expected
+        names, _, where = said.partition(" in ")
+        assert all((tmp_path / where / name).is_file() for name in names.split(", "))
