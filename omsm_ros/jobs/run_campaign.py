@@ -274,7 +274,12 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         finally:
             executor.shutdown(cancel_futures=True)
         return
-    address = urlsplit(scheduler)
+    try:
+        address = urlsplit(scheduler)
+    except ValueError as err:
+        raise ConfigurationError(
+            f"scheduler {scheduler!r} is no address: {said(err)}; write tcp://host:port"
+        ) from err
     local = address.scheme == "tcp" and address.hostname in _LOCAL_HOSTS
     if not (local or address.scheme == "tls"):
         raise ConfigurationError(

@@ -76,7 +76,8 @@ def _said(found: jsonschema.ValidationError) -> str:
             return f"{said}, expected {wanted!r}"
         case "enum":
             return f"{said}, expected one of {wanted!r}"
-        case "maxItems" | "minItems":
-            limit = "at most" if found.validator == "maxItems" else "at least"
-            return f"{place} has {len(found.instance)} values, expected {limit} {wanted}"  # type: ignore[arg-type]
-    return f"{place}: {found.message[:200]}"
+        case "maxItems" | "minItems" | "maxLength" | "minLength":
+            limit = "at most" if found.validator.startswith("max") else "at least"
+            unit = "values" if found.validator.endswith("Items") else "characters"
+            return f"{place} has {len(found.instance)} {unit}, expected {limit} {wanted}"  # type: ignore[arg-type]
+    return f"{said}, expected {found.validator} {shown(wanted)}"

@@ -160,6 +160,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
         (["--uncertainty", "-1"], "standard uncertainty"),
         (["--nominal", "missing.yaml"], "no surface at 'missing.yaml'"),
         (["--spacing", "1e-9"], "widen it"),
+        (["--spacing", "2e-6"], "expected 40 401 at most"),  # a minute's work
         (["--register", "auto"], "--register needs the surface"),
         (["--register", "roll"], "roll"),
     ],

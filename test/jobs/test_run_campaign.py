@@ -161,6 +161,11 @@ def test_a_damaged_state_is_named(tmp_path, text, said):
         load_campaign(tmp_path)
 
 
+def test_a_scheduler_that_is_no_address_is_refused(shop, tmp_path):
+    with pytest.raises(ConfigurationError, match="no address: Invalid IPv6"):
+        run_campaign(shop / "bags", shop / "cal.json", tmp_path, scheduler="tcp://[31m:5")
+
+
 @pytest.mark.parametrize("address", ["tcp://10.0.0.7:8786", "ws://localhost:1", "localhost"])
 def test_a_scheduler_beyond_this_host_needs_tls(shop, tmp_path, address):
     with pytest.raises(ConfigurationError, match="tls://"):

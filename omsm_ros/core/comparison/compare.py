@@ -23,11 +23,13 @@ from omsm_ros.core.comparison.verdict import Verdict, verdict_of
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
-from omsm_ros.readable import quantity
+from omsm_ros.readable import count, quantity
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 MOST_ACROSS = 200
 """Places across the map of a difference: thirty in half a wave of the sixth order."""
+# Finer places would cost minutes, and lie between means of the same cells.
+_MOST_PLACES = (MOST_ACROSS + 1) ** 2
 
 # Of the radius: an error of a form that nobody knows is correlated over it, which makes most of
 # it the terms of low order that a comparison looks at.
@@ -130,8 +132,12 @@ def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
             "the two measurements do not overlap; do they lie in one frame, and in one unit?"
         )
     counts = [int((h - c) / side) + 1 for c, h in zip(low, high, strict=True)]
-    if max(counts) > 20 * MOST_ACROSS:
-        raise DataError(f"a spacing of {quantity(side, 'm')} makes {counts!r} places; widen it")
+    if max(counts) > _MOST_PLACES or counts[0] * counts[1] > _MOST_PLACES:
+        raise DataError(
+            f"a spacing of {quantity(side, 'm')} makes {counts[0]:.4g} × {counts[1]:.4g} places, "
+            f"expected {count(_MOST_PLACES)} at most, which is as fine as points are resampled; "
+            "widen it"
+        )
     x0, y0 = (c + (h - c) % side / 2 for c, h in zip(low, high, strict=True))
     return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
 
