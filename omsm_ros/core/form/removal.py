@@ -16,9 +16,9 @@ from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_value
 
 # Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a
 # turned part has all around, to order 12.
-_POWER = (Term(0, 0), Term(1, -1), Term(1, 1), Term(2, 0))
+POWER = (Term(0, 0), Term(1, -1), Term(1, 1), Term(2, 0))
 _FORM = terms_up_to(4)
-_SYMMETRIC = tuple(Term(n, 0) for n in range(4, 14, 2))
+SYMMETRIC = tuple(Term(n, 0) for n in range(4, 14, 2))
 
 
 def without(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
@@ -48,9 +48,14 @@ def without_second_order(map_: DeviationMap) -> DeviationMap:
     return without(map_, np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]))
 
 
+def without_tilt(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map without piston and tilts."""
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER[:3]))
+
+
 def without_power(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without piston, tilts and power: the irregularity of ISO 10110-5."""
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), _POWER))
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER))
 
 
 def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
@@ -63,7 +68,7 @@ def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
 
 def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without power and without what is the same all around, up to order 12."""
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), _POWER + _SYMMETRIC))
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
 
 
 def _scaled(values: FloatArray) -> FloatArray:

@@ -72,14 +72,45 @@ def test_terms_of_the_standard_are_those_of_known_zernikes():
     map_ = disc_map(sizes, effects=({Term(2, 0): 1e-9},))
     fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC, effects=map_.effects)
     found = optical_terms(map_, fit)
-    assert found["iso10110_A"].value == pytest.approx(40e-9, rel=1e-6)
+    # Random points are no even disc: their best sphere is 40.002 nm.
+    u, v = DISC.scaled(map_.x, map_.y)
+    sphere = np.stack([np.ones_like(u), u, v, u**2 + v**2], axis=1)
+    power = np.linalg.lstsq(sphere, map_.deviation, rcond=None)[0][3]
+    assert found["iso10110_A"].value == pytest.approx(power, rel=1e-6)
+    assert power == pytest.approx(40e-9, rel=1e-4)
     assert found["iso10110_A"].uncertainty == pytest.approx(2e-9, rel=1e-3)
     irregular = np.hypot(10e-9 / np.sqrt(5), 5e-9 / np.sqrt(6))
     assert found["iso10110_RMSi"].value == pytest.approx(irregular, rel=0.01)
     assert found["iso10110_RMSa"].value == pytest.approx(5e-9 / np.sqrt(6), rel=0.01)
+    # 10 nm of spherical aberration is 6ρ⁴ − 6ρ² + 1: from −5 to 10 nm.
+    assert found["iso10110_C"].value == pytest.approx(15e-9, rel=0.02)
+    assert found["iso10110_C"].uncertainty < 1e-12
+    total = np.hypot(irregular, 20e-9 / np.sqrt(3))
+    assert found["iso10110_RMSt"].value == pytest.approx(total, rel=0.01)
     # Power is no irregularity, nor is what may be wrong with it.
     assert found["iso10110_RMSi"].uncertainty < 1e-13
     assert 10e-9 < found["iso10110_B"].value < 26e-9
+
+
+@pytest.mark.parametrize("kind", ["strip", "ring"])
+def test_the_sagitta_of_a_part_of_a_disc_is_that_of_the_sphere_that_fits_it(kind):
+    """Terms that share what a sphere takes, on a strip, are no figure of the part."""
+    rng, n = np.random.default_rng(9), 20_000
+    u, v = rng.uniform(-1, 1, n), rng.uniform(-0.06, 0.06, n)
+    if kind == "ring":
+        r, angle = np.sqrt(rng.uniform(0.5, 1, n)), rng.uniform(-np.pi, np.pi, n)
+        u, v = r * np.cos(angle), r * np.sin(angle)
+    form = 8e-9 * u**2 + 4e-9 * np.cos(5 * u) + 3e-9 * (u**2 + v**2) ** 2 + 3e-9 * u * v
+    map_ = DeviationMap(
+        x=DISC.x + DISC.radius * u, y=DISC.y + DISC.radius * v, area=np.ones(n),
+        deviation=form + rng.normal(0, 1e-10, n), effects=np.empty((0, n)), noise=1e-10,
+    )  # fmt: skip
+    sphere = np.stack([np.ones(n), u, v, u**2 + v**2], axis=1)
+    expected = abs(np.linalg.lstsq(sphere, map_.deviation, rcond=None)[0][3])
+    fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC)
+    found = optical_terms(map_, fit)["iso10110_A"]
+    assert found.value == pytest.approx(expected, rel=1e-6)
+    assert found.uncertainty < 0.5e-9
 
 
 def test_form_goes_and_ripple_stays():
