@@ -20,7 +20,12 @@ from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.form.power_density import Curve, PowerDensity, power_density
 from omsm_ros.core.form.profiles import profiles
 from omsm_ros.core.form.removal import best_fit, without_form, without_second_order
-from omsm_ros.core.form.texture import Bands, bands_of, texture
+from omsm_ros.core.form.texture import (
+    Bands,
+    bands_of,
+    slopes_without_second_order,
+    texture,
+)
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import (
@@ -101,14 +106,14 @@ def analyse_form(
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
     zernike = with_open_place(zernike, map_, found)
     cells = Cells.of(map_)
-    formless = Cells.of(without_form(map_, found.disc))
     bands = bands_of(cells, *filters)
-    figures = _figures(map_, gathered, found) | optical_terms(map_, zernike)
     return Form(
         registration=found,
         aperture=found.disc,
         map=map_,
-        deviation=figures | texture(cells, formless, bands),
+        deviation=_figures(map_, gathered, found)
+        | optical_terms(map_, zernike)
+        | _textures(map_, cells, bands, found),
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -136,6 +141,15 @@ def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> di
         # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
         "rms_before_fit": Figure(found.before, None),
     }
+
+
+def _textures(
+    map_: DeviationMap, cells: Cells, bands: Bands, found: Registration
+) -> dict[str, Figure]:
+    formless, rest = without_form(map_, found.disc), without_second_order(map_)
+    return texture(cells, Cells.of(formless), bands) | slopes_without_second_order(
+        Cells.of(rest), bands
+    )
 
 
 class _Gathered:

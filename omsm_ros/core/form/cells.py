@@ -16,6 +16,8 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 
 # Eight points leave a third of their noise in a cell (1/√8).
 _MOST_ACROSS, _POINTS_PER_CELL = 256, 8.0
+# A profile has one row; its cells are as fine as its points.
+_MOST_ALONG = 1024
 # Of the weighting function exp(−π (x / α λ)²): half of a sine of wavelength λ passes.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))
 
@@ -45,8 +47,11 @@ class Cells:
         # Of a strip fewer are needed across; eight points a cell where the area is filled.
         side = np.sqrt(max(spans[0] * spans[1], 1e-6 * max(spans) ** 2) / len(map_))
         pitch = max(float(side * np.sqrt(_POINTS_PER_CELL)), max(spans) / _MOST_ACROSS)
+        if min(spans) == 0:
+            pitch = max(spans) / min(max(len(map_) - 1, 1), _MOST_ALONG) or 1.0
+        # What lies on an edge but for rounding lies beyond it.
         column, row = (
-            ((values - values.min()) / pitch).astype(np.int64) for values in (map_.x, map_.y)
+            ((values - values.min()) / pitch + 1e-9).astype(np.int64) for values in (map_.x, map_.y)
         )
         shape = int(row.max()) + 1, int(column.max()) + 1
         place = row * shape[1] + column

@@ -74,9 +74,10 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     """
     few = map_.every(_MOST_FITTED)
     fit = _smooth(few, disc)
-    base = _without_noise(few, fit)
+    base, noise = _without_noise(few, fit)
     chosen = slice(None, None, -(-len(few) // _MOST_DRAWN))
     ways = _drawn(few, fit, base, chosen)
+    scatter = _scattered(base[chosen], noise)
     area = few.area[chosen]
 
     def robust(deviations: FloatArray, area: FloatArray) -> FloatArray:
@@ -93,7 +94,8 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
         again, more, likely, full = (extent(drawn, area) ** 2 for drawn in ways)
         square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
         of_taken = _rms(full - np.mean(likely))
-        spread = _length(float(np.std(again)), _rms(more - again), of_taken)
+        of_noise = float(np.std(extent(scatter, area) ** 2))
+        spread = _length(float(np.std(again)), _rms(more - again), of_taken, of_noise)
         figure = _of_square(square, spread)
         found.append(Figure((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
@@ -107,13 +109,22 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     return fit_zernikes(*points, terms, disc, weights=map_.area)
 
 
-def _without_noise(map_: DeviationMap, fit: ZernikeFit) -> FloatArray:
-    """Return the smooth deviations (n,), and of the rest the share that is no noise (Wiener)."""
+def _without_noise(map_: DeviationMap, fit: ZernikeFit) -> tuple[FloatArray, float]:
+    """Return the smooth deviations (n,), and of the rest the share that is no noise (Wiener).
+
+    And the noise of a point that is left in that share [m].
+    """
     smooth = fit.height(map_.x, map_.y)
     rest = map_.deviation - smooth
     variance = float(np.mean(rest**2))
     share = max(1 - map_.noise**2 / variance, 0.0) if variance > 0 else 0.0
-    return np.asarray(smooth + share * rest, np.float64)
+    return np.asarray(smooth + share * rest, np.float64), share * map_.noise
+
+
+def _scattered(base: FloatArray, noise: float) -> FloatArray:
+    """Return deviations (m, draws) whose points lie elsewhere within the noise left in them."""
+    random = np.random.default_rng(_SEED + 1)
+    return np.asarray(base[:, np.newaxis] + noise * random.normal(size=(len(base), _DRAWS)))
 
 
 def _drawn(

@@ -77,10 +77,22 @@ def texture(cells: Cells, formless: Cells, bands: Bands) -> dict[str, Figure]:
     found = {name: surface.figure(of) for name, of in _PARAMETERS.items()}
     for name, (long, short) in bands.rms_bands.items():
         found[f"rms_{name}"] = _band(formless if long else cells, long, short).figure(_rms)
+    return found | _slope_figures(cells, bands)
+
+
+def slopes_without_second_order(rest: Cells, bands: Bands) -> dict[str, Figure]:
+    """Return the rms slope [1] of cells whose second order was taken off."""
+    return {"slope_rms_without_second_order": _slope_figures(rest, bands)["slope_rms"]}
+
+
+def _slope_figures(cells: Cells, bands: Bands) -> dict[str, Figure]:
     smooth = _band(cells, None, bands.s_filter, whole=True)
-    found["slope_rms"] = smooth.figure(lambda image: _slopes(image, cells)[0])
-    found["slope_largest"] = smooth.figure(lambda image: _slopes(image, cells)[1])
-    return found
+    if not len(_slopes(smooth.values, cells)):
+        return dict.fromkeys(("slope_rms", "slope_largest"), Figure(None, None))
+    return {
+        "slope_rms": smooth.figure(lambda image: _rms_about_zero(_slopes(image, cells))),
+        "slope_largest": smooth.figure(lambda image: float(np.max(_slopes(image, cells)))),
+    }
 
 
 def _band(cells: Cells, long: float | None, short: float, whole: bool = False) -> _Filtered:
@@ -112,13 +124,20 @@ _PARAMETERS: dict[str, Callable[[FloatArray], float]] = {
 }
 
 
-def _slopes(image: FloatArray, cells: Cells) -> tuple[float, float]:
-    """Return rms and largest slope over two cells, where all neighbours are there."""
-    here = cells.present
-    inside = here[1:-1, 2:] & here[1:-1, :-2] & here[2:, 1:-1] & here[:-2, 1:-1]
-    if not np.any(inside):
-        return 0.0, 0.0
-    along_x = (image[1:-1, 2:] - image[1:-1, :-2])[inside]
-    along_y = (image[2:, 1:-1] - image[:-2, 1:-1])[inside]
-    steep = np.hypot(along_x, along_y) / (2 * cells.pitch)
-    return float(np.sqrt(np.mean(steep**2))), float(steep.max())
+def _rms_about_zero(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _slopes(image: FloatArray, cells: Cells) -> FloatArray:
+    """Return the slopes (k,) over two cells where all neighbours are there; of a row, along it."""
+    ways = [axis for axis, size in enumerate(image.shape) if size > 1]
+    inside = cells.present.copy()
+    square = np.zeros(image.shape)
+    for axis in ways:
+        before, after = (np.roll(image, way, axis) for way in (1, -1))
+        square += (after - before) ** 2
+        # What is rolled in from the other side is no neighbour.
+        there = np.pad(cells.present, [(1, 1) if n == axis else (0, 0) for n in (0, 1)])
+        size = image.shape[axis]
+        inside &= there.take(range(size), axis) & there.take(range(2, size + 2), axis)
+    return np.asarray(np.sqrt(square[inside]) / (2 * cells.pitch)) if ways else np.empty(0)

@@ -3,7 +3,8 @@
 Read off the scan as it ran. Where the path turns about the spindle, a point stands for the arc that
 it covers, ``r |Δθ|``, whatever the speed was and however many points beside it were lost; each ring
 of equal area and a few turns counts alike, whatever the feed was while it was crossed, and one that
-was seen in part, as at the rim of a part beside the spindle's axis, by that part. Elsewhere
+was seen in part, as at the rim of a part beside the spindle's axis, by that part. On a single line
+a point stands for the way from half-way to the one before to half-way to the one after. Elsewhere
 each cell of a grid counts alike that is as fine as the tracks allow.
 """
 
@@ -27,6 +28,8 @@ _SECTORS = round(2 * np.pi / _LARGEST_ARC)
 # The side of a grid; the number of its cells falls to a quarter as their size doubles where they
 # fill the surface, and to a half where they lie along single tracks.
 _MOST_CELLS, _FILLED = 512, 3.5
+# Of its length: as wide as a single line may be.
+_LINE_WIDTH = 1e-6
 
 
 def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatArray:
@@ -36,6 +39,10 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
     """
     if even:
         return np.ones(len(x))
+    along = _along_line(x, y)
+    if along is not None:
+        weights = _ways(along)
+        return np.asarray(weights / np.mean(weights), np.float64)
     angle = np.unwrap(np.arctan2(y, x))
     turned = _turns(angle)
     share = np.ones(len(x))
@@ -53,6 +60,26 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
 def turns(x: FloatArray, y: FloatArray) -> float:
     """Return how many times the path gets around the origin."""
     return _turns(np.unwrap(np.arctan2(y, x)))
+
+
+def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
+    """Return the place of each point (n,) along the line that all lie on [m]; None if on none."""
+    across = np.stack([x - np.mean(x), y - np.mean(y)])
+    direction = np.linalg.eigh(across @ across.T)[1]
+    width, length = (float(np.ptp(way @ across)) for way in direction.T)
+    if length == 0 or width > _LINE_WIDTH * length:
+        return None
+    return np.asarray(direction[:, 1] @ across, np.float64)
+
+
+def _ways(along: FloatArray) -> FloatArray:
+    """Return the way (n,) that each point stands for [m]; across a gap nobody has looked."""
+    order = np.argsort(along, kind="stable")
+    steps = np.diff(along[order])
+    steps = np.minimum(steps, _MOST_STEPS * float(np.median(steps[steps > 0])))
+    ways = np.empty(len(along))
+    ways[order] = (np.r_[0.0, steps] + np.r_[steps, 0.0]) / 2
+    return ways
 
 
 def _turns(angle: FloatArray) -> float:

@@ -26,7 +26,8 @@ _FIGURES = {
     "rms": "rms",
     "peak_to_valley_best_fit": "peak to valley of what no move of the part explains (best fit)",
 }
-_OTHER_UNITS = {"Ssk": "", "Sku": "", "slope_rms": "rad", "slope_largest": "rad"}
+_SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
+_OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
 _SIGNED = ("Ssk",)
 _CONFORMITY = {
     "holds": ("good", "The part holds its tolerance"),

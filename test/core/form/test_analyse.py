@@ -65,3 +65,28 @@ def test_an_aperture_beside_the_points_is_refused():
     x, y = RNG.uniform(-0.02, 0.02, (2, 5000))
     with pytest.raises(DataError, match="0 points lie on the nominal surface"):
         form(x, y, 0 * x, aperture=Aperture(0.001, 0.5, 0.0))
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.6])
+def test_a_profile_has_the_figures_of_its_line(turned):
+    """Points twice as dense on one half: each stands for the way that it covers, at any angle."""
+    along = np.r_[np.arange(-400, 0) * 0.05e-3, np.arange(0, 201) * 0.1e-3]
+    form_, ripple, period = 3e-6 * along**2 / 0.02**2, 5e-9, 2e-3
+    wave = 2 * np.pi / period
+    noise = np.random.default_rng(3).normal(0, 0.05e-9, len(along))
+    height = form_ + ripple * np.sin(wave * along) + noise
+    found = form(along * np.cos(turned), along * np.sin(turned), height, "piston").deviation
+    even = np.linspace(-0.02, 0.02, 40_001)
+    truth = 3e-6 * even**2 / 0.02**2 + ripple * np.sin(wave * even)
+    rms, extent = (found[f"{name}_best_fit"] for name in ("rms", "peak_to_valley"))
+    assert rms.value == pytest.approx(np.std(truth), rel=2e-3)
+    assert abs(extent.value - np.ptp(truth)) < 2 * extent.uncertainty + 0.01e-9
+    # What noise adds to an extent is about its own size, in two places.
+    assert 0.02e-9 < extent.uncertainty < 0.3e-9
+    rest = found["rms_without_second_order"]
+    assert rest.value == pytest.approx(ripple / np.sqrt(2), rel=0.01)
+    if turned == 0:
+        slope = found["slope_rms_without_second_order"]
+        assert slope.value == pytest.approx(ripple * wave / np.sqrt(2), rel=0.05)
+        both = np.hypot(ripple * wave / np.sqrt(2), 2 * 3e-6 / 0.02 / np.sqrt(3))
+        assert found["slope_rms"].value == pytest.approx(both, rel=0.01)

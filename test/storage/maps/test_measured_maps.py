@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from omsm_ros.core.form.analyse import analyse_form
+from omsm_ros.core.registration.placement import Portion
 from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import FileError
 from omsm_ros.storage.maps.dabam_file import load_dabam
 from omsm_ros.storage.maps.read_map import read_points
@@ -57,6 +60,25 @@ def test_a_dabam_profile_of_slopes():
     assert np.std(rest) == pytest.approx(stated, rel=0.05)
     back = np.gradient(points.height, points.x)[1:-1]
     assert back == pytest.approx(profile.value[1:-1], abs=0.1e-6)
+
+
+@pytestmark_data
+@pytest.mark.parametrize(
+    ("name", "rms", "extent", "slope"),
+    [("012", 2.503e-9, 11.535e-9, 0.3188e-6), ("018", 1.7556e-9, 7.087e-9, 0.12e-6)],
+)
+def test_the_form_of_a_profile_is_what_its_file_and_a_parabola_say(name, rms, extent, slope):
+    """Height less a parabola by numpy alone; slope as the header has it, of points 1 mm apart."""
+    points = read_points(DATA / "dabam" / f"dabam-{name}.dat")
+    portion = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
+    found = analyse_form(Flat(), lambda: [portion], ("piston", "tilt")).deviation
+    for figure, truth in (
+        ("rms_without_second_order", rms),
+        ("peak_to_valley_without_second_order", extent),
+        ("slope_rms_without_second_order", slope),
+    ):
+        off = abs(found[figure].value - truth)
+        assert off < 2 * found[figure].uncertainty + 0.02 * truth, figure
 
 
 HEADER = '{"FILE_FORMAT": 2, "FILE_HEADER_LINES": 1, "X1_FACTOR": 0.001, "Y1_FACTOR": 1e-9}'
