@@ -34,3 +34,9 @@ def test_noise_is_taken_out_of_the_motion_and_motion_is_not():
     error = np.sum(np.abs(kept - clean[: len(kept)]) ** 2)
     assert error < 0.5 * np.sum(np.abs(noisy - clean) ** 2)
     assert np.sum(np.abs(clean[len(kept) :]) ** 2) < 1e-6 * np.sum(np.abs(clean) ** 2)
+
+
+def test_motion_up_to_half_the_sampling_rate_is_kept_to_its_last_line():
+    spectrum = np.full(200, 1.0 + 1.0j)
+    kept = denoised(spectrum, 1e-12)
+    np.testing.assert_allclose(kept, spectrum, rtol=1e-9)

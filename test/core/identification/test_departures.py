@@ -253,6 +253,10 @@ class TestHidden:
         assert told.covariance[0, 0] < 0.01 * free.covariance[0, 0]
         entry = next(e for e in told.certificate["could_hide"] if e["family"] == CREEP)
         assert entry["prior"] == entry["carried"] == 1e-6
+        # Both costs on a scan are of one effect per unit: of what is carried, of what is missed.
+        for each in told.certificate["could_hide"]:
+            effect = each["effect_on_scan_m"] / each["carried"]
+            assert each["missed_effect_on_scan_m"] == pytest.approx(effect * each["missed"])
 
     @pytest.mark.parametrize("prior", [0.0, -1.0, "small", True])
     def test_a_prior_is_a_positive_number(self, prior):

@@ -13,6 +13,7 @@ from omsm_ros.core.fitting.output_error import Problem, fit
 from omsm_ros.core.fitting.steps import find_steps
 from omsm_ros.core.identification.residual_tests import (
     independence,
+    noise_colour,
     residual_tests,
     response_agreement,
     whiteness,
@@ -123,3 +124,15 @@ def test_the_response_without_a_model_agrees_with_the_truth_and_not_with_another
 
     assert agreement(through(60.0)) == pytest.approx(1.0, abs=0.4)
     assert agreement(through(60.1)) > 10
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5])
+def test_the_colour_of_noise_at_rest_is_that_of_its_filter(memory):
+    """Of e(k) = a e(k-1) + w(k) the density at rest is (1 + a)/(1 - a) of its mean."""
+    problem, steps = stepped(0.0005, noise=0.0)
+    white = np.random.default_rng(8).normal(0, 1e-8, len(problem.output))
+    noise = signal.lfilter([1.0], [1.0, -memory], white)
+    problem = replace(problem, output=problem.output + noise)
+    found = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    colour = noise_colour(problem, found, steps)
+    assert colour == pytest.approx((1 + memory) / (1 - memory), rel=0.25)

@@ -186,6 +186,8 @@ def test_path_within_one_exposure_is_the_loss_of_a_boxcar() -> None:
     found = limit("path within one exposure", path, MachineLimits(exposure=tau))
     lost = AMPLITUDE * (1 - np.sinc(FREQUENCY * tau))
     assert found.value == pytest.approx(lost, rel=0.02)
+    # Half of the budget of 50 nm, k = 2, is the standard error; the loss grows with the square.
+    assert found.speed_factor == pytest.approx(np.sqrt(25e-9 / lost), rel=0.02)
 
 
 def test_spacing_at_the_rim() -> None:

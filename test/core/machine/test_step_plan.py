@@ -103,3 +103,9 @@ def test_a_smaller_second_step_makes_room_for_more():
     plan_steps(sample_period=1e-3, second_step=3e-6, count=15)
     with pytest.raises(ConfigurationError, match=r"15 steps travel 147 µm.*range"):
         plan_steps(sample_period=1e-3, count=15)
+
+
+def test_each_plateau_is_as_long_as_was_asked_for_but_for_the_dither():
+    """Edge k comes k dwells after the start, and by less than a sample period later."""
+    late = np.array(PLAN.starts) - 0.5 * np.arange(1, 21)
+    assert np.all((late >= -1e-12) & (late < 1e-3))

@@ -94,3 +94,12 @@ def test_a_multisine_has_its_lines_and_no_others():
 def test_impossible_motions_are_refused(make):
     with pytest.raises(ConfigurationError):
         make()
+
+
+def test_the_usual_chirp_is_the_papers():
+    """0 to 15 Hz in 25 s, 40 µm peak to peak: 187.5 swings, each of which crosses zero twice."""
+    chirp = Chirp()
+    z = chirp.positions(np.linspace(0.0, 25.0, 500_001)).z
+    assert chirp.duration == 25.0
+    assert np.ptp(z) == pytest.approx(40e-6, rel=1e-6)
+    assert np.sum(np.diff(np.sign(z)) != 0) == 375

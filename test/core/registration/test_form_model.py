@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from omsm_ros.core.registration.form_model import Estimate
+from omsm_ros.core.registration.form_model import Estimate, _unlucky
 from omsm_ros.core.registration.freedoms import parsed_freedoms
 from omsm_ros.core.registration.placement import FREEDOMS, Aperture, Portion
 from omsm_ros.core.registration.register import register
@@ -24,6 +25,15 @@ def test_a_step_is_measured_in_its_own_uncertainty():
     step = mixed @ np.array([2.0, -1.0, 2.0])
     made = Estimate(step, np.zeros(2), covariance, np.zeros(2), 1.0, covariance)
     assert made.length == pytest.approx(3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("terms", [4, 12])
+@pytest.mark.parametrize("unknown", [0.0, 0.5])
+def test_a_size_found_from_few_terms_may_be_larger(terms, unknown):
+    """A mean of ν squares lies below that of all by ν/χ²(ν) in one of seven; half known, half ν."""
+    factor = _unlucky(np.full(terms, unknown), np.zeros(terms, np.int64))
+    known = terms * (1 - unknown)
+    assert factor == pytest.approx(known / stats.chi2.ppf(0.15, known), rel=0.03)
 
 
 @pytest.mark.soak

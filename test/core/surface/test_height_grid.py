@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.height_grid import HeightGrid, as_grid
+from omsm_ros.core.surface.height_grid import GridSurface, HeightGrid, as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import DataError
 
@@ -84,3 +84,13 @@ def test_no_points_are_refused():
 def test_a_map_that_is_none_is_refused(change):
     with pytest.raises(DataError, match="map"):
         HeightGrid(**{"height": np.zeros((2, 2)), "x0": 0, "y0": 0, "dx": 1, "dy": 1} | change)
+
+
+def test_a_map_has_its_heights_up_to_its_last_row_and_column():
+    random = np.random.default_rng(4)
+    grid = HeightGrid(height=random.normal(size=(6, 9)), x0=-0.3, y0=0.7, dx=1e-3, dy=2.5e-4)
+    surface = GridSurface(grid)
+    x, y = np.meshgrid(grid.x, grid.y)
+    np.testing.assert_allclose(surface.height(x, y), grid.height, atol=1e-9)
+    beyond = surface.height(grid.x[-1] + np.array([1e-5, 0.0]), grid.y[-1] + np.array([0.0, 1e-5]))
+    assert np.all(np.isnan(beyond))
