@@ -14,7 +14,9 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import Chirp, Circle
 from omsm_ros.core.spectra.hypotheses import FOLDED, PART
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
+from omsm_ros.jobs.correct_bag import MOST_DRAWN
 from omsm_ros.jobs.measure import measure
+from omsm_ros.jobs.publish import view_of
 from omsm_ros.jobs.spectrum import SpectrumOfScan, SpectrumOptions, spectra_of, summary_of
 from omsm_ros.jobs.verify_calibration import path_check_of
 from omsm_ros.jobs.write_recording import write_recording
@@ -23,8 +25,11 @@ from omsm_ros.report.common import style
 from omsm_ros.report.common.tables import Table
 from omsm_ros.report.experiments import figures
 from omsm_ros.report.experiments.page import Compared, ExperimentPage, render
+from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.report.measurement.page import CAPTIONS as SCAN_CAPTIONS
 from omsm_ros.report.spectrum.page import CAPTIONS, drawn
-from omsm_ros.storage.files import REPORT, SUMMARY, save_json, save_text
+from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json, save_text
 from omsm_ros.storage.result_folder import MEASUREMENT_FILES, result_folder
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.channels import Accelerometer
@@ -49,6 +54,9 @@ SHAKING_HZ, SHAKING_M = 680.0, 4.5 * NANOMETRE_M
 _CIRCLE_SECONDS = 20.0
 # Of a probe that reads texture of 10 nm: less noise than that on a step test.
 _TEXTURE_PROBE = Probe(noise=2 * NANOMETRE_M, resolution=1 * NANOMETRE_M)
+# Fig. 8: the deviation before and after, and a section.
+_MAPS = ("raw_map", "corrected_map_same_scale", "corrected_map")
+_OF_MIRROR = (*_MAPS, "profile_x", "profile_y")
 _EXPOSURE_S, _ACCELEROMETER_S = 0.5e-3, 0.25e-3
 
 
@@ -193,7 +201,8 @@ def _spectrum_page(
         for scan in scans
         for row in scan.named
     ]
-    table = Table("Lines", ("seen at", "amplitude", "σ", "is", "because"), lines)
+    columns = ("seen at", "amplitude", "σ", "is", "because")
+    table = Table("Lines", columns, lines, prose="because")
     facts = {"spectrum": summary_of(scans, SpectrumOptions())}
     captions = {name: CAPTIONS[name] for name in kept}
     return _Done(facts, ExperimentPage(title, summary, rows, (table,), captions, kept))
@@ -217,10 +226,21 @@ def _mirror(out: Path, seed: int) -> _Done:
         Compared("points", "290 011 in 6 minutes", count(points),
                  "from 12.7 mm to the centre; 290 011 take a start at 14.5 mm"),
     ]  # fmt: skip
-    return _Done(
-        {"summary": found},
-        ExperimentPage("The off-axis paraboloid (Fig. 8)", "the dynamic error is gone", rows),
-    )
+    return _Done({"summary": found}, ExperimentPage(
+        "The off-axis paraboloid (Fig. 8)", "the dynamic error is gone", rows,
+        captions={name: SCAN_CAPTIONS[name].text for name in _OF_MIRROR},
+        figures=_mirror_figures(out),
+        narrow=_MAPS,
+    ))  # fmt: skip
+
+
+def _mirror_figures(out: Path) -> dict[str, bytes]:
+    """Return the maps and profiles of Fig. 8, of the cloud in ``out``."""
+    view = view_of(CloudFile(out / CLOUD).read(MOST_DRAWN), Scenario().sample_period)
+    if view is None:
+        return {}
+    made = surface_figures(view, PAPER_MIRROR)
+    return {name: made[name] for name in _OF_MIRROR if name in made}
 
 
 EXPERIMENTS: dict[str, Callable[[Path, int], _Done]] = {

@@ -16,6 +16,8 @@ from omsm_ros.core.form.removal import (
     without_tilt,
 )
 from omsm_ros.core.form.zernike_fit import CHUNK, ZernikeFit
+from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import Term, zernike_values
 
 
@@ -29,21 +31,38 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, Figure]:
     reflected by it.
     """
     irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
-    symmetric = replace(
-        irregular,
-        deviation=irregular.deviation - uneven.deviation,
-        effects=irregular.effects - uneven.effects,
-        # A few terms of all points: what they leave of the noise of one is next to nothing.
-        noise=map_.noise * float(np.sqrt(len(SYMMETRIC) / len(map_))),
-    )
     return {
         "iso10110_A": _sagitta(map_, fit),
         "iso10110_B": extents_of_part(irregular, fit.disc)[1],
-        "iso10110_C": extents_of_part(symmetric, fit.disc)[1],
+        "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[1],
         "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
         "iso10110_RMSi": rms_of_part(irregular),
         "iso10110_RMSa": rms_of_part(uneven),
     }
+
+
+def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the part of the irregularity that is the same all around.
+
+    It has no noise of single points: what they do to its few terms is in its effects.
+    """
+    of_noise = replace(map_, effects=np.concatenate([map_.effects, _shaken(map_, disc)]), noise=0.0)
+    irregular, uneven = without_power(of_noise, disc), asymmetric(of_noise, disc)
+    return replace(
+        irregular,
+        deviation=irregular.deviation - uneven.deviation,
+        effects=irregular.effects - uneven.effects,
+    )
+
+
+def _shaken(map_: DeviationMap, disc: Aperture) -> FloatArray:
+    """Return independent effects (k, n) [m] of the noise of points on the symmetric terms."""
+    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
+    weighted = columns * map_.area
+    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
+    covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T @ columns, np.float64)
 
 
 def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> Figure:

@@ -12,7 +12,10 @@ from omsm_ros.report.common.verdict import Verdict
 
 @dataclass(frozen=True, slots=True)
 class StudyPage:
-    """captions, figures: PNG files and what is to be read under them, by name"""
+    """captions, figures: PNG files and what is to be read under them, by name
+
+    narrow: of the figures, those that stand three in a line
+    """
 
     title: str
     subtitle: str
@@ -20,6 +23,7 @@ class StudyPage:
     sections: tuple[Section, ...]
     captions: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, bytes] = field(default_factory=dict)
+    narrow: tuple[str, ...] = ()
     footer: str = ""
 
 

@@ -23,7 +23,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class ExperimentPage:
-    """captions, figures: by name, PNG files"""
+    """captions, figures: by name, PNG files;  narrow: those that stand three in a line"""
 
     title: str
     summary: str
@@ -31,12 +31,13 @@ class ExperimentPage:
     tables: tuple[Table, ...] = ()
     captions: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, bytes] = field(default_factory=dict)
+    narrow: tuple[str, ...] = ()
 
 
 def render(page: ExperimentPage) -> str:
     """Return the page as HTML."""
     rows = [(row.name, row.paper, row.ours, row.remark) for row in page.rows]
-    beside = Table("", ("the paper", "the twin", ""), rows)
+    beside = Table("", ("the paper", "the twin", "remark"), rows, prose="remark")
     return fill_study(
         StudyPage(
             title=page.title,
@@ -48,6 +49,7 @@ def render(page: ExperimentPage) -> str:
             ),
             captions=page.captions,
             figures=page.figures,
+            narrow=page.narrow,
             footer="Light: Advanced Manufacturing 2025, doi 10.37188/lam.2025.078. The twin has "
             "the paper's Eq. 12 with the s that its print lacks; its truth is known.",
         )

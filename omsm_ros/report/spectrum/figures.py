@@ -138,7 +138,10 @@ def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | N
                 one.plot(
                     [at, at], [level - 0.35, level + 0.35], color=COLOURS[row.kind], linewidth=1.6
                 )
-    style.logarithmic(one.xaxis)
+    style.logarithmic(one.xaxis, every=(1.0, 2.0, 5.0))
+    low, high = one.get_xlim()
+    # Lines near one another would leave no number between them.
+    one.set_xlim(min(low, high / 10), high)
     one.set_yticks(range(len(scans)), [studied.signal.name for studied, _ in scans])
     one.invert_yaxis()
     style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")

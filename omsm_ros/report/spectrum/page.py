@@ -95,7 +95,7 @@ def _peak_table(scan: Mapping[str, Any]) -> Table:
         for peak in scan["peaks"]
     ]
     columns = ("seen at", "wavelength", "amplitude", "σ", "truly", "because")
-    return Table(scan["name"], columns, rows)
+    return Table(scan["name"], columns, rows, prose="because")
 
 
 def _true(peak: Mapping[str, Any]) -> str:

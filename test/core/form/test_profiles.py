@@ -1,5 +1,7 @@
 """Profiles and optical terms of maps that are known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,19 @@ def test_terms_of_the_standard_are_those_of_known_zernikes():
     # Power is no irregularity, nor is what may be wrong with it.
     assert found["iso10110_RMSi"].uncertainty < 1e-13
     assert 10e-9 < found["iso10110_B"].value < 26e-9
+
+
+def test_the_symmetric_irregularity_is_as_uncertain_as_its_scatter():
+    """Noise shakes its few terms: as much as thirty scans scatter, not nothing."""
+    still = disc_map({Term(4, 0): 10e-9, Term(2, 2): 5e-9}, points=8_000)
+    rng, values = np.random.default_rng(12), []
+    for _ in range(30):
+        noisy = still.deviation + rng.normal(0, 5e-9, len(still))
+        map_ = replace(still, deviation=noisy, noise=5e-9)
+        fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(9), DISC)
+        figure = optical_terms(map_, fit)["iso10110_C"]
+        values.append(figure.value)
+    assert figure.uncertainty == pytest.approx(np.std(values), rel=0.5)
 
 
 @pytest.mark.parametrize("kind", ["strip", "ring"])
