@@ -14,6 +14,10 @@ from omsm_ros.readable import count
 _MOST_NAMED = 3
 # What the samples hold above it is the encoder's noise rather than the path.
 _CONTENT_SHARE = 0.999
+# The Fourier transform of a length with a large prime factor takes ten times as long. Of so many
+# samples, the few at the end that make up such a factor are less than half a per cent.
+_LONG = 65_536
+_SMALL_FACTORS = (2, 3, 5, 7, 11, 13)
 # Derivatives are those of quintics over a quarter period of the fastest content, but of at least
 # so many samples, so that the encoder's noise stays below the path.
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
@@ -126,6 +130,8 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
     few whole turns have no such jump, but get one where a cubic is taken off; so the lower counts.
     """
     velocity = np.diff(z)
+    if len(velocity) > _LONG:
+        velocity = velocity[: _with_small_factors(len(velocity))]
     steady = np.full(len(velocity), np.mean(velocity))
     return min(
         _content_beside(slow, velocity, sample_period) for slow in (steady, _slow_part(velocity))
@@ -148,6 +154,18 @@ def _content_beside(slow: FloatArray, velocity: FloatArray, sample_period: float
     gathered = slowly + np.cumsum(moved)
     place = int(np.argmax(gathered >= _CONTENT_SHARE * gathered[-1]))
     return float(place / (len(velocity) * sample_period))
+
+
+def _with_small_factors(number: int) -> int:
+    """Return the largest number up to ``number`` with ``_SMALL_FACTORS`` alone."""
+    for found in range(number, 1, -1):
+        rest = found
+        for factor in _SMALL_FACTORS:
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return found
+    return 1
 
 
 def _slow_part(velocity: FloatArray) -> FloatArray:

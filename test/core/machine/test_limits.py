@@ -81,6 +81,14 @@ def test_of_few_turns_the_content_is_that_of_many(turns):
     assert content_frequency(z, PERIOD) == pytest.approx(0.5 * waves, abs=0.26)
 
 
+@pytest.mark.parametrize("length", [70_002, 290_012, 559_872])  # its steps: a large prime factor
+def test_the_content_of_a_long_scan_is_that_of_its_sine_whatever_its_length(length):
+    """Four turns and a bit: what is left out at the end is no jump that counts."""
+    period = 4.03 / length
+    z = 1e-3 * np.sin(2 * np.pi * np.arange(length) * period)
+    assert content_frequency(z, period) == pytest.approx(1.0, abs=0.26)
+
+
 @pytest.mark.parametrize("servo", [50.0, 200.0])
 @pytest.mark.parametrize("factor", [1.0, 7.0])
 def test_following_error_of_a_sine_is_that_of_the_servo(servo: float, factor: float) -> None:
