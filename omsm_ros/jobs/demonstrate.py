@@ -18,7 +18,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import Recursion, past_motion
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.errors import OmsmError
+from omsm_ros.errors import OmsmError, printable
 from omsm_ros.jobs import measure as measurement
 from omsm_ros.jobs import publish as publication
 from omsm_ros.jobs.correct_bag import correct_bag
@@ -161,7 +161,7 @@ def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
     width = max(len(name) for name, _ in rows)
     body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
     files = ", ".join(summary["files"].values())
-    return f"\n{TITLE}\n\n{body}\n\n  in {os.path.relpath(plan.out)}: {files}\n"
+    return f"\n{TITLE}\n\n{body}\n\n  in {printable(os.path.relpath(plan.out))}: {files}\n"
 
 
 def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:

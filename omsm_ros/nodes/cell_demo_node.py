@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 from omsm_ros.emulators.players import EMULATED
-from omsm_ros.errors import DeviceTimeoutError, OmsmError
+from omsm_ros.errors import DeviceTimeoutError, OmsmError, one_line
 from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
 from omsm_ros.seconds import beside, tick
@@ -270,7 +270,7 @@ def main() -> None:
         with stage("correcting the bag offline, comparing with the truth"):
             summary = conclude(plan)
     except OmsmError as err:
-        print(f"omsm demo: {err}", file=sys.stderr)
+        print(f"omsm demo: {one_line(err)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("omsm demo: interrupted", file=sys.stderr)

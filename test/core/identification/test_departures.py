@@ -10,6 +10,7 @@ from omsm_ros.core.departures.families import (
     BACKLASH,
     CREEP,
     DRIFT,
+    FASTEST_CREEP_S,
     FRICTION,
     MODE,
     VIBRATION,
@@ -338,3 +339,12 @@ def test_a_failure_of_the_algebra_is_one_clear_error(monkeypatch):
     monkeypatch.setattr("omsm_ros.core.identification.identify.prepare", fails)
     with pytest.raises(IdentificationError, match=r"SVD did not converge.*check the units"):
         identify(record_of())
+
+
+@pytest.mark.parametrize("share", [3e-4, -2e-3])
+def test_the_share_of_slow_poles_is_their_partial_fraction(share):
+    """ε/(1 + sτ) + (1 - ε)/(1 + sT): only the first is slower than a structure's."""
+    slow, fast = 4 * FASTEST_CREEP_S, 0.5 * FASTEST_CREEP_S
+    numerator = [1.0, share * fast + (1 - share) * slow]
+    whole = TransferFunction.from_ascending(numerator, [1.0, slow + fast, slow * fast])
+    assert relaxation_found(whole) == pytest.approx(abs(share), rel=1e-9)
