@@ -121,19 +121,21 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
         if part(summary, "deviation", "corrected"):
             rows = [("piston, the unknown stand-off of the probe", "mean of the area", NOTHING)]
         return Table(title, columns, rows)
-    rows = []
+    fitted = []
     for name in part(form, "removed", "fitted") or ():
         pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
         spread = settled(form, name)
-        rows.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
+        fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
-    # Each says in words how well the points determine it.
-    rows += [(f"not {name}", f"held: {why}", NOTHING) for name, why in held.items()]
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
-    rows += [
-        (f"not {name}", f"{why}{dragged(form, name)}", NOTHING) for name, why in refused.items()
-    ]
-    return Table(title, columns, rows)
+    # Each says in words how well the points determine it.
+    reasons = {name: f"held: {why}" for name, why in held.items()}
+    reasons |= {name: f"{why}{dragged(form, name)}" for name, why in refused.items()}
+    if not reasons:
+        return Table(title, columns, fitted)
+    rows = [(*row, "") for row in fitted]
+    rows += [(f"not {name}", NOTHING, NOTHING, why) for name, why in reasons.items()]
+    return Table(title, (*columns, "why not"), rows, prose="why not")
 
 
 def settled(form: Mapping[str, Any], name: str) -> float | None:

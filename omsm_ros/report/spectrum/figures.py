@@ -109,11 +109,15 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
     made, axes = style.figure(_WIDTH_IN, 3.0)
     one = axes[0, 0]
     style.logarithmic(one.xaxis)
-    style.logarithmic(one.yaxis)
+    if any(np.any(spectrum.density > 0) for _, spectrum in spectra):
+        style.logarithmic(one.yaxis)
     for k, (name, spectrum) in enumerate(spectra):
         frequency, level = smoothed(spectrum)
         colour = list(COLOURS.values())[k % len(COLOURS)]
-        one.plot(frequency, np.sqrt(level) / NANOMETRE_M, linewidth=0.9, color=colour, label=name)
+        # A Z that stands still has no density, and no logarithm.
+        if np.any(level > 0):
+            heights = np.sqrt(level) / NANOMETRE_M
+            one.plot(frequency, heights, linewidth=0.9, color=colour, label=name)
     if valid_up_to is not None:
         top = max(float(s.frequency[-1]) for _, s in spectra)
         one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")

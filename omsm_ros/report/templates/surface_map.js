@@ -255,8 +255,12 @@ function text(number) {
 // Heights from a picture whose red and green are the two bytes of a step; step 0 = missing.
 async function decoded(address, least, step) {
   const picture = new Image();
-  picture.src = address;
-  await picture.decode();
+  // The page has not loaded before its pictures have: whoever prints it then finds the map drawn.
+  await new Promise((done, failed) => {
+    picture.onload = done;
+    picture.onerror = failed;
+    picture.src = address;
+  });
   const canvas = document.createElement("canvas");
   canvas.width = picture.naturalWidth;
   canvas.height = picture.naturalHeight;

@@ -76,8 +76,9 @@ def test_an_unknown_unit_is_refused():
         embedded([layer(unit="ell")])
 
 
-def page():
-    return render(Report("Mirror", "today", {}, map=embedded([layer(), layer(seed=1)])))
+def page(layers=None):
+    layers = layers or [layer(), layer(seed=1)]
+    return render(Report("Mirror", "today", {}, map=embedded(layers)))
 
 
 def test_the_page_allows_this_script_and_no_other():
@@ -113,3 +114,24 @@ def test_a_browser_draws_it_from_a_file(tmp_path):
     for colour in ((68, 1, 84), (253, 231, 37)):
         near = np.all(np.abs(255 * picture - colour) < 12, axis=2)
         assert near.sum() > 300, found.stderr[-500:]
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium on this machine")
+def test_a_page_that_is_printed_as_soon_as_it_has_loaded_has_its_map(tmp_path):
+    """Four maps take a while to decode; drawn, one is a picture of hundreds of places each way."""
+    noise = np.random.default_rng(2).normal(0, 1e-8, 400_000)
+    large = layer(400_000)
+    layers = [Layer(f"map {n}", large.x, large.y, noise, "nm", True) for n in range(4)]
+    (tmp_path / "page.html").write_text(page(layers), encoding="utf-8")
+    found = subprocess.run(
+        [
+            "chromium", "--headless", "--no-sandbox", "--disable-gpu",
+            f"--user-data-dir={tmp_path / 'profile'}", "--no-pdf-header-footer",
+            f"--print-to-pdf={tmp_path / 'page.pdf'}", (tmp_path / "page.html").as_uri(),
+        ],
+        capture_output=True, timeout=50, check=False,
+    )  # fmt: skip
+    printed = (tmp_path / "page.pdf").read_bytes()
+    widths = [int(width) for width in re.findall(rb"/Width (\d+)", printed)]
+    assert widths, found.stderr[-500:]
+    assert max(widths) > 300
