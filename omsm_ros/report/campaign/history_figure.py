@@ -33,7 +33,7 @@ def draw(machines: Sequence[History]) -> bytes:
             _points(lag, rows, "delay", "delay_uncertainty", MICROSECOND_S, colour, mark)
             _points(gain, rows, "static_gain", "static_gain_uncertainty", 1.0, colour, mark)
         _points(form, machine.measurements, "deviation_rms", "", NANOMETRE_M, colour, ".")
-        lag.plot([], [], "o", color=colour, label=machine.machine or "not named")
+        lag.plot([], [], "o", color=colour, label=style.named(machine.machine) or "not named")
     style.label(lag, y="µs", title="Lag of slow motion, k = 2")
     style.label(gain, title="Static gain, k = 2")
     style.label(form, y="nm", title="Deviation from nominal, rms by area", x="recorded (UTC)")

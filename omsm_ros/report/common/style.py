@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import printable
 
 # Okabe and Ito's blue and vermillion differ in hue and lightness for every kind of sight.
 BEFORE = "#D55E00"
@@ -136,10 +138,18 @@ def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelop
     return time[starts], np.minimum.reduceat(value, starts), np.maximum.reduceat(value, starts)
 
 
+def named(name: str) -> str:
+    """Return a name from outside as a figure can draw it: as it is written, no mathematics."""
+    return printable(name).replace("$", r"\$")
+
+
 def png(made: Figure, dpi: int = FIGURE_DPI) -> bytes:
     """Return the figure as a PNG file, the same bytes for the same figure."""
     buffer = io.BytesIO()
-    made.savefig(
-        buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs=dict(FAST_PNG)
-    )
+    with warnings.catch_warnings():
+        # Names may be in any script: what the font does not have is drawn as a box.
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        made.savefig(
+            buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs=dict(FAST_PNG)
+        )
     return buffer.getvalue()

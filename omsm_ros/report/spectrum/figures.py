@@ -45,7 +45,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
         values = evenly(signal.time, studied.formless.residual, signal.period)
         _curve(row, density(values, signal.period), 1.0)
         _marks(row, named, TIME, 1.0, signal.duration)
-        style.label(row, y="nm/√Hz", title=f"{signal.name}, over time")
+        style.label(row, y="nm/√Hz", title=f"{style.named(signal.name)}, over time")
     _kinds(axes[0, 0], [row for _, named in scans for row in named])
     style.label(axes[-1, 0], x="frequency [Hz]", y="nm/√Hz", title=axes[-1, 0].get_title("left"))
     return made
@@ -64,7 +64,7 @@ def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | 
         _curve(row, density(values, step), MICROMETRE_M, over=True)
         _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
         row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
-        style.label(row, y="nm·√mm", title=f"{signal.name}, along the path")
+        style.label(row, y="nm·√mm", title=f"{style.named(signal.name)}, along the path")
     title = axes[-1, 0].get_title("left")
     style.label(
         axes[-1, 0],
@@ -116,8 +116,8 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
         colour = list(COLOURS.values())[k % len(COLOURS)]
         # A Z that stands still has no density, and no logarithm.
         if np.any(level > 0):
-            heights = np.sqrt(level) / NANOMETRE_M
-            one.plot(frequency, heights, linewidth=0.9, color=colour, label=name)
+            heights, shown = np.sqrt(level) / NANOMETRE_M, style.named(name)
+            one.plot(frequency, heights, linewidth=0.9, color=colour, label=shown)
     if valid_up_to is not None:
         top = max(float(s.frequency[-1]) for _, s in spectra)
         one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")
@@ -146,7 +146,7 @@ def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | N
     low, high = one.get_xlim()
     # Lines near one another would leave no number between them.
     one.set_xlim(min(low, high / 10), high)
-    one.set_yticks(range(len(scans)), [studied.signal.name for studied, _ in scans])
+    one.set_yticks(range(len(scans)), [style.named(s.signal.name) for s, _ in scans])
     one.invert_yaxis()
     style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")
     return made
