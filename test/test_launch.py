@@ -1,14 +1,12 @@
 """What the launch file starts, on stand-ins for launch and launch_ros, which wheels lack."""
 
-import importlib.util
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from launch_stand_in import modules, nodes_of
 
 import omsm_ros
 from omsm_ros.nodes.start import LAUNCHED_BY
@@ -16,67 +14,12 @@ from omsm_ros.nodes.start import LAUNCHED_BY
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 
 
-@dataclass
-class Node:
-    package: str
-    executable: str
-    arguments: list
-    namespace: str = ""
-    parameters: list = field(default_factory=list)
-    remappings: list = field(default_factory=list)
-    additional_env: dict = field(default_factory=dict)
-    respawn: bool = False
-    respawn_delay: float = 0.0
-    output: str = ""
-
-
-class Argument:
-    def __init__(self, name, default_value, description, choices):
-        self.name, self.default = name, default_value
-        assert description
-        assert choices is None or default_value in choices
-
-
-class Configuration:
-    def __init__(self, name):
-        self.name = name
-
-    def perform(self, context):
-        return context[self.name]
-
-
-class Function:
-    def __init__(self, function):
-        self.function = function
-
-
 @pytest.fixture
 def launch(monkeypatch):
     """Call with arguments; the nodes by their names."""
-    made = {
-        "launch": {"LaunchContext": dict, "LaunchDescription": list},
-        "launch.actions": {"DeclareLaunchArgument": Argument, "OpaqueFunction": Function},
-        "launch.substitutions": {"LaunchConfiguration": Configuration},
-        "launch_ros": {},
-        "launch_ros.actions": {"Node": Node},
-        "ament_index_python": {},
-        "ament_index_python.packages": {"get_package_share_directory": lambda _: str(ROOT)},
-    }
-    for name, content in made.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
+    for name, module in modules().items():
         monkeypatch.setitem(sys.modules, name, module)
-    path = ROOT / "launch" / "cell.launch.py"
-    spec = importlib.util.spec_from_file_location("cell_launch", path)
-    file = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(file)
-    *arguments, opaque = file.generate_launch_description()
-
-    def started(**given):
-        context = {argument.name: argument.default for argument in arguments} | given
-        return {node.executable: node for node in opaque.function(context)}
-
-    return started
+    return lambda **given: {n.executable: n for n in nodes_of("cell.launch.py", **given)}
 
 
 def test_a_real_cell_is_what_its_yaml_says(launch):

@@ -189,7 +189,14 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "static_gain": calibration.static_gain,
         "static_gain_uncertainty": calibration.certificate.get("static_gain_uncertainty"),
         "valid_up_to": calibration.valid_up_to,
+        "polarity": calibration.certificate.get("polarity"),
     }
+
+
+_RISES = (
+    "rises when Z rises: turn its sign where recordings come from (map, driver) and identify "
+    "again, or correct with --polarity -1"
+)
 
 
 def _stated(facts: Facts, name: str, unit: str) -> str:
@@ -216,6 +223,8 @@ def _show(facts: Facts) -> None:
             ("static gain", _stated(facts, "static_gain", "")),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
         ]
+        if facts["polarity"] == -1:
+            rows.append(("distance", _RISES))
     for kind in ("reasons", "reservations", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts.get(kind, [])]
     rows.append(written([facts.get("calibration") or facts["model"]]))

@@ -1,4 +1,4 @@
-"""Every command that a document shows is one that is understood; those of the manual also run."""
+"""Every command that a document names is one that is understood; test_run_pages runs them."""
 
 import argparse
 import re

@@ -1,10 +1,8 @@
-"""The manual's commands do what it says, and Sphinx makes it without a warning."""
+"""Sphinx makes the manual without a warning; what its commands do is in test_run_pages."""
 
-import os
 import re
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -13,41 +11,6 @@ import omsm_ros
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-PAGES = [DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-# What stands in a block of "sh" is run; what needs a machine, ROS or a network is "text".
-COMMANDS = re.compile(r"^ *```sh\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
-
-
-def commands_of(page):
-    """The blocks of a page that are to be run, one after the other."""
-    return [textwrap.dedent(b) for b in COMMANDS.findall(page.read_text(encoding="utf-8"))]
-
-
-# `make soak` runs all; the tutorial, which shows nearly every command, takes half a minute.
-QUICK = ("first-calibration",)
-
-
-@pytest.mark.timeout(180)
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(p, id=p.stem, marks=() if p.stem in QUICK else pytest.mark.soak)
-        for p in PAGES
-        if commands_of(p)
-    ],
-)
-def test_every_command_runs_as_it_stands(page, tmp_path):
-    script = [
-        "set -eu",
-        f'omsm() {{ {sys.executable} -W error -m omsm_ros.cli "$@"; }}',
-        *commands_of(page),
-    ]
-    done = subprocess.run(
-        ["bash", "-c", "\n".join(script)],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 def test_what_the_tutorial_promises_is_there(tmp_path):

@@ -2,13 +2,9 @@
 
 import os
 import time
-from contextlib import contextmanager, suppress
 
 import pytest
-
-from omsm_ros.errors import ConfigurationError
-from omsm_ros.storage.claim import claimed
-from omsm_ros.storage.runtime_folder import runtime_folder
+from own_domain import own_domain
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
@@ -21,17 +17,6 @@ def ros():
         rclpy.init()
         yield
         rclpy.try_shutdown()
-
-
-@contextmanager
-def own_domain():
-    """One that no other run of these tests on this machine uses."""
-    for k in range(100):
-        domain = 102 + (os.getpid() + k) % 100
-        with suppress(ConfigurationError), claimed(runtime_folder() / f"domain_{domain}"):
-            yield domain
-            return
-    pytest.fail("no free ROS_DOMAIN_ID")
 
 
 class Cell:
