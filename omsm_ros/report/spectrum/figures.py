@@ -122,7 +122,8 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
         top = max(float(s.frequency[-1]) for _, s in spectra)
         one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")
     style.label(one, x="frequency [Hz]", y="nm/√Hz", title="Motion of Z")
-    style.legend(one, loc="upper right")
+    if one.get_legend_handles_labels()[1]:
+        style.legend(one, loc="upper right")
     return made
 
 
