@@ -10,7 +10,6 @@ from omsm_ros.core.departures.families import (
     BACKLASH,
     CREEP,
     DRIFT,
-    FASTEST_CREEP_S,
     FRICTION,
     MODE,
     VIBRATION,
@@ -224,6 +223,10 @@ def test_the_band_holds_a_relaxation_found_or_not(size, time_constant):
     assert np.all(np.abs(off.imag) < 3 * band.phase)
 
 
+def test_a_plateau_is_the_time_between_edges():
+    assert survey_of().plateau == pytest.approx(StepTest().dwell, abs=2 * PERIOD)
+
+
 class TestHidden:
     def test_a_missed_relaxation_would_have_been_seen(self):
         """The size said to be missed with 5 % is found nearly always, a third of it hardly."""
@@ -339,12 +342,3 @@ def test_a_failure_of_the_algebra_is_one_clear_error(monkeypatch):
     monkeypatch.setattr("omsm_ros.core.identification.identify.prepare", fails)
     with pytest.raises(IdentificationError, match=r"SVD did not converge.*check the units"):
         identify(record_of())
-
-
-@pytest.mark.parametrize("share", [3e-4, -2e-3])
-def test_the_share_of_slow_poles_is_their_partial_fraction(share):
-    """ε/(1 + sτ) + (1 - ε)/(1 + sT): only the first is slower than a structure's."""
-    slow, fast = 4 * FASTEST_CREEP_S, 0.5 * FASTEST_CREEP_S
-    numerator = [1.0, share * fast + (1 - share) * slow]
-    whole = TransferFunction.from_ascending(numerator, [1.0, slow + fast, slow * fast])
-    assert relaxation_found(whole) == pytest.approx(abs(share), rel=1e-9)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 
-from omsm_ros.core.departures.families import DRIFT, relaxed
-from omsm_ros.core.departures.hidden import hidden_terms, without_drift
+from omsm_ros.core.departures.families import DRIFT, FASTEST_CREEP_S, relaxed
+from omsm_ros.core.departures.hidden import hidden_terms, relaxation_found, without_drift
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import response_band
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.identify import identify
@@ -92,3 +93,12 @@ def sigmas(calibration, size):
     band = response_band(calibration.dynamics, calibration.covariance, at)
     assert off == pytest.approx(size, rel=0.3)
     return off / float(np.hypot(band.gain, band.phase)[0])
+
+
+@pytest.mark.parametrize("share", [3e-4, -2e-3])
+def test_the_share_of_slow_poles_is_their_partial_fraction(share):
+    """ε/(1 + sτ) + (1 - ε)/(1 + sT): only the first is slower than a structure's."""
+    slow, fast = 4 * FASTEST_CREEP_S, 0.5 * FASTEST_CREEP_S
+    numerator = [1.0, share * fast + (1 - share) * slow]
+    whole = TransferFunction.from_ascending(numerator, [1.0, slow + fast, slow * fast])
+    assert relaxation_found(whole) == pytest.approx(abs(share), rel=1e-9)

@@ -72,3 +72,13 @@ def test_neighbouring_intervals_meet() -> None:
         BASIS.rows(k, edge, np.array([0.7])).heights(coefficients[BASIS.terms(k)]) for k in (1, 2)
     )
     np.testing.assert_allclose(before, after, rtol=1e-12)
+
+
+def test_the_rim_is_in_the_last_interval() -> None:
+    inside, angle = points(3000)
+    radius, angle = np.append(inside, [BASIS.inner, BASIS.outer]), np.append(angle, [0.3, 0.4])
+    assert BASIS.interval(radius)[-2:].tolist() == [0, BASIS.intervals - 1]
+    height = (radius / 1e-2) ** 3
+    terms = matrix(radius, angle)
+    cubic = np.linalg.lstsq(terms[:-2], height[:-2], rcond=None)[0]
+    np.testing.assert_allclose(terms @ cubic, height, atol=1e-9)
