@@ -278,7 +278,9 @@ def _prysm(x: FloatArray, y: FloatArray, value: FloatArray, mine: float) -> Row:
         return not_compared(name, "1", ">= 2", f"prysm: {type(err).__name__}")
     begin = process_time()
     r, angle = np.hypot(x, y) / RADIUS, np.arctan2(y, x)
-    modes = list(polynomials.zernike_nm_seq([tuple(t) for t in first_terms(37)], r, angle))
+    # Releases and the source name it differently.
+    sequence = getattr(polynomials, "zernike_nm_seq", None) or polynomials.zernike_nm_sequence
+    modes = list(sequence([tuple(t) for t in first_terms(37)], r, angle))
     polynomials.lstsq(modes, value)
     return at_least(name, (process_time() - begin) / mine, "1", 2.0, "prysm")
 
