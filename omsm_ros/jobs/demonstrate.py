@@ -157,11 +157,12 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
     """Return the result for the terminal."""
-    rows = [*sample_rows(summary), *_accuracy_rows(summary)]
+    where = printable(os.path.relpath(plan.out))
+    written = ", ".join(summary["files"].values())
+    rows = [*sample_rows(summary), *_accuracy_rows(summary), ("written", f"{written} in {where}")]
     width = max(len(name) for name, _ in rows)
     body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
-    files = ", ".join(summary["files"].values())
-    return f"\n{TITLE}\n\n{body}\n\n  in {printable(os.path.relpath(plan.out))}: {files}\n"
+    return f"\n{TITLE}\n\n{body}\n"
 
 
 def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:

@@ -74,7 +74,7 @@ def end_all_but(kept):
     lines = NODES.read_text().splitlines() if NODES.exists() else []
     ended = [line for line in lines if line.split()[1] != kept]
     for line in ended:
-        os.kill(int(line.split()[0]), signal.SIGINT)
+        os.killpg(int(line.split()[0]), signal.SIGINT)
     for line in ended:
         until = time.monotonic() + DEADLINE_S
         while Path(f"/proc/{line.split()[0]}/cmdline").exists() and alive(line.split()[0]):
@@ -186,6 +186,6 @@ if __name__ == "__main__":
         os.execv(REAL, [REAL, verb, *words, *once])
     import rclpy
 
-    rclpy.init()
+    rclpy.init(args=[])
     NODE = rclpy.create_node("follows_the_page")
     VERBS[verb](*words)

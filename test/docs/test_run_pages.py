@@ -172,12 +172,12 @@ def ended(nodes):
     running = [line.split() for line in lines]
     left = {int(pid): name for pid, name in running if alive(pid)}
     for pid in left:
-        os.kill(pid, signal.SIGINT)
+        os.killpg(pid, signal.SIGINT)  # as Ctrl-C, to all of it
     until = time.monotonic() + 30
     while any(map(alive, left)) and time.monotonic() < until:
         time.sleep(0.05)
     for pid in filter(alive, left):
-        os.kill(pid, signal.SIGKILL)
+        os.killpg(pid, signal.SIGKILL)
         pytest.fail(f"{left[pid]} did not end")
     for log in nodes.parent.glob("*.log"):
         assert "Traceback" not in log.read_text(errors="replace"), log.read_text()[-2000:]
