@@ -132,6 +132,41 @@ def test_lines_scanned_at_other_speeds_count_by_their_area() -> None:
     assert np.mean(y > 0) > 0.75
 
 
+@pytest.mark.parametrize("lines", [8, 12, 16, 17, 31, 100])
+@pytest.mark.parametrize("slower", [1, 4])
+def test_of_few_lines_each_stands_for_the_way_to_the_next(lines: int, slower: int) -> None:
+    """The mean square over a square by the trapezoidal rule, whatever the lines' speed was."""
+    rows = np.linspace(-1.0, 1.0, lines)
+    along = [np.linspace(-1.0, 1.0, 500 * (slower if row > 0 else 1)) for row in rows]
+    x, y = np.concatenate(along), np.repeat(rows, [len(line) for line in along])
+    weights = area_weights(RADIUS * x, RADIUS * y)
+    assert np.average(np.sign(y), weights=weights) == pytest.approx(0.0, abs=0.02)
+    trapezoid = np.trapezoid(rows**2, rows) / 2
+    assert np.average(y**2, weights=weights) == pytest.approx(trapezoid, rel=0.03)
+    # Between the ends of two lines the rim of what was scanned is a bay.
+    assert np.average(x**2, weights=weights) == pytest.approx(1 / 3, rel=0.8 / lines)
+
+
+@pytest.mark.parametrize("lines", [21, 50, 127])
+def test_lines_over_a_disc_weigh_it_as_it_is(lines: int) -> None:
+    rows = np.linspace(-1.0, 1.0, lines)
+    half = np.sqrt(np.maximum(1 - rows**2, 0.0))
+    along = [np.linspace(-h, h, int(2000 * h) + 1) for h in half]
+    x, y = np.concatenate(along), np.repeat(rows, [len(line) for line in along])
+    weights = area_weights(RADIUS * x, RADIUS * y)
+    # At the rim a line stands for half of the way.
+    assert np.average(x**2 + y**2, weights=weights) == pytest.approx(0.5, rel=1 / lines)
+
+
+def test_a_hole_that_nobody_scanned_has_no_area() -> None:
+    x, y = raster()
+    kept = np.hypot(x, y) > 0.5 * RADIUS
+    weights = area_weights(x[kept], y[kept])
+    square = np.average(x[kept] ** 2, weights=weights) / RADIUS**2
+    # Of the square (-1, 1)² without a disc of half its width: (4/3 - π/64) / (4 - π/4).
+    assert square == pytest.approx((4 / 3 - np.pi / 64) / (4 - np.pi / 4), rel=0.01)
+
+
 def test_they_have_mean_one_and_points_in_one_place_are_alike() -> None:
     assert np.mean(area_weights(*spiral())) == pytest.approx(1.0)
     assert np.mean(area_weights(*raster())) == pytest.approx(1.0)
