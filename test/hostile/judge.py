@@ -7,6 +7,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from omsm_ros.storage.cloud_file import CloudFile
 
 LONGEST_S = 5.0
 MOST_BYTES = 1024**3
+RESULT = "out"
 # Words of a remedy: what a message says to do.
 REMEDIES = (
     "check", "delete", "expected", "give", "install", "use", "record", "identify", "write", "see",
@@ -41,7 +43,8 @@ class Case:
     files: dict[str, bytes] = field(default_factory=dict)
 
     def lay(self, folder: Path) -> None:
-        """Write the files into ``folder``."""
+        """Write the files into ``folder``, where nothing is left of another command's result."""
+        shutil.rmtree(folder / RESULT, ignore_errors=True)
         for name, content in self.files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
@@ -137,8 +140,8 @@ def _check(facts: dict[str, object], folder: Path) -> None:
     if isinstance(samples, dict):
         for account in (a for a in samples.values() if isinstance(a, dict)):
             assert account["received"] == account["corrected"] + sum(account["counted"].values())
-        if (folder / "out" / "cloud.ply").exists():
-            cloud = CloudFile(folder / "out" / "cloud.ply").read()
+        if (folder / RESULT / "cloud.ply").exists():
+            cloud = CloudFile(folder / RESULT / "cloud.ply").read()
             assert len(cloud) == samples["axes"]["corrected"]
             for name in ("x", "y", "height", "dynamic_error", "uncertainty"):
                 assert np.isfinite(cloud[name]).all(), name
