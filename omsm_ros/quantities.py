@@ -226,7 +226,7 @@ TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.
 SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")
 HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
-SPEED = Quantity("spindle speed", "rpm", -1e5, 1e5, "give it in turns a minute")
+SPEED = Quantity("spindle speed", "rpm", 1e-3, 1e5, "give it in turns a minute", signed=True)
 
 # Devices.
 
