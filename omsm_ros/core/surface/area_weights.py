@@ -128,7 +128,7 @@ def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the cell of each point (n,), and of each cell the area that lies nearest to it (k,).
 
     Cells with points share the scanned area as Voronoi's polygons do. The scanned area is that of
-    these cells and of all between them that is nowhere as wide as tracks lie apart.
+    these cells, and of the gaps into which no disc fits whose radius is the distance of tracks.
     """
     # Loading it takes as long as weighing; a scan that turns needs none of it.
     from scipy import ndimage
