@@ -18,6 +18,7 @@ from enum import Enum
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -27,6 +28,7 @@ from omsm_ros.errors import OmsmError, one_line
 from omsm_ros.nodes import topics
 from omsm_ros.nodes.declared import Declared
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, survive
+from omsm_ros.nodes.memory import RETURN_PERIOD_S, give_back
 from omsm_ros.parameters import Parameter
 
 NAMESPACE = "omsm"
@@ -64,6 +66,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._answer_impossible_transitions()
         self.diagnostics = Diagnostics(self, self._report, self.hardware_id)
         self.create_service(Trigger, f"~/{topics.TAKEN}", topics.tell_taken)
+        self.create_timer(RETURN_PERIOD_S, give_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # What a node fills in.
 

@@ -16,6 +16,7 @@ import sys
 from pathlib import Path
 
 from omsm_ros.loading import nothing_to_undo
+from omsm_ros.nodes.memory import share_one_pool
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a node to end."""
@@ -24,7 +25,6 @@ LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, and that it ends with."""
 
 _BAD_INPUT = 2
-_M_ARENA_MAX = -8  # of <malloc.h>
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OTHER_NAMES = {"replay": "player"}
 _NO_ROS = (
@@ -69,13 +69,6 @@ def end_with_launch() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
         sys.exit(f"the launch that started this node ({launch}) has ended")
-
-
-def share_one_pool() -> None:
-    """Let all threads share one pool of memory; each of the middleware's would keep its own."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc has it
-    if mallopt is not None:
-        mallopt(_M_ARENA_MAX, 1)
 
 
 def send_aside() -> None:
