@@ -29,8 +29,8 @@ from omsm_ros.report.measurement.gallery import surface_figures
 from omsm_ros.report.measurement.page import CAPTIONS as SCAN_CAPTIONS
 from omsm_ros.report.spectrum.page import CAPTIONS, drawn
 from omsm_ros.storage.cloud_file import CloudFile
-from omsm_ros.storage.files import CLOUD, REPORT, SUMMARY, save_json, save_text
-from omsm_ros.storage.result_folder import MEASUREMENT_FILES, result_folder
+from omsm_ros.storage.files import CLOUD, EXPERIMENT, REPORT, save_json, save_text
+from omsm_ros.storage.result_folder import EXPERIMENT_FILES, result_folder
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.channels import Accelerometer
 from omsm_ros.twin.disturbances import Disturbances
@@ -67,13 +67,13 @@ class _Done:
 
 
 def run_experiment(name: str, out: Path, seed: int = 1) -> dict[str, Any]:
-    """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its page, bags and summary."""
-    with result_folder(out, MEASUREMENT_FILES) as folder:
+    """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its page, bags and figures."""
+    with result_folder(out, EXPERIMENT_FILES) as folder:
         done = EXPERIMENTS[name](folder, seed)
         rows = [asdict(row) for row in done.page.rows]
         facts = {"experiment": name, "seed": seed, "compared": rows, **done.facts}
         save_text(folder / REPORT, render(done.page))
-        save_json(folder / SUMMARY, facts)
+        save_json(folder / EXPERIMENT, facts)
     return facts
 
 

@@ -17,7 +17,7 @@ CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
 SYSTEMATIC = "systematic.npz"
 FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
 """The files of a measurement."""
-SPECTRUM, DIFFERENCE = "spectrum.json", "difference.json"
+SPECTRUM, DIFFERENCE, EXPERIMENT = "spectrum.json", "difference.json", "experiment.json"
 
 
 def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:

@@ -17,6 +17,7 @@ from omsm_ros.storage.files import (
     CURVES,
     DEVIATION,
     DIFFERENCE,
+    EXPERIMENT,
     FORM,
     REPORT,
     SPECTRUM,
@@ -29,9 +30,11 @@ from omsm_ros.storage.files import (
 
 FORM_FILES = (DEVIATION, CURVES, REPORT, FORM)
 MEASUREMENT_FILES = (CLOUD, SYSTEMATIC, *FORM_FILES, SUMMARY)
+EXPERIMENT_FILES = (*MEASUREMENT_FILES, EXPERIMENT)
 
-# Results that have a name in common. A measurement may hold its form.
+# Results that have a name in common. An experiment may hold a measurement, that its form.
 _RESULTS = {
+    EXPERIMENT: EXPERIMENT_FILES,
     SUMMARY: MEASUREMENT_FILES,
     FORM: FORM_FILES,
     SPECTRUM: (REPORT, SPECTRUM),
@@ -47,7 +50,8 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
 
     names: of the files that make a result; those of an earlier run go. The last of them says
         that the result is whole: it is taken away first and comes last, so that nobody ever
-        sees it beside files of another run. Other files in ``path`` stay.
+        sees it beside files of another run. Other files in ``path`` stay; one that this run
+        makes beside its result replaces only that of an earlier run.
 
     FileError if it cannot be written there, or where the result of another command is that has
     files of these names; then, as after any exception, ``path`` is unchanged.
@@ -93,9 +97,14 @@ def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
         else:
             return
         # Another writer came first: what follows replaces its files.
+    again = (target / names[-1]).is_file()
     for part in staged.iterdir():
         if (target / part.name).is_dir():
             raise IsADirectoryError(None, f"{part.name!r} there is a folder; remove it")
+        if part.name not in names and (target / part.name).exists() and not again:
+            raise FileExistsError(
+                None, f"{part.name!r} is there and no result; give another folder"
+            )
     lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)  # one writer after the other

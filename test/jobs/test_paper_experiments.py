@@ -8,8 +8,10 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.verification.free_path import excited_bands
+from omsm_ros.errors import FileError
 from omsm_ros.jobs import paper_experiments
 from omsm_ros.jobs.paper_experiments import run_experiment
+from omsm_ros.report.experiments.page import ExperimentPage
 from omsm_ros.twin.scenario import Scenario
 
 
@@ -41,7 +43,7 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     folded = next(p for p in shaken["peaks"] if p["kind"] == "folded vibration")
     assert folded["true_frequency"] == pytest.approx(680.0, abs=0.01)
     assert folded["frequency"] == pytest.approx(320.0, abs=0.05)
-    assert json.loads((tmp_path / "v/summary.json").read_text())["experiment"] == "vibration"
+    assert json.loads((tmp_path / "v/experiment.json").read_text())["experiment"] == "vibration"
 
 
 def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
@@ -54,8 +56,29 @@ def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
     assert raw > after
     page = (tmp_path / "m/report.html").read_text()
     assert "290 011 in 6 minutes" in page.replace("\u202f", " ")
+    # Beside the page it is a measurement like any other, which can be judged again.
+    assert json.loads((tmp_path / "m/summary.json").read_text())["samples"]
     # Fig. 8 is maps before and after, and sections.
     assert page.count("data:image/png") == 5
+
+
+def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
+    """Neither somebody's recording nor a measurement is replaced by the twin's; a second run is."""
+
+    def quick(out, seed):
+        (out / "chirp.mcap").write_text(f"of seed {seed}")
+        return paper_experiments._Done({}, ExperimentPage("", "", []))
+
+    monkeypatch.setitem(paper_experiments.EXPERIMENTS, "chirp", quick)
+    for name, said in (("chirp.mcap", "is there and no result"), ("summary.json", "of another")):
+        (tmp_path / name).write_text("{}")
+        with pytest.raises(FileError, match=said):
+            run_experiment("chirp", tmp_path)
+        assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [(name, "{}")]
+        (tmp_path / name).unlink()
+    for seed in (1, 2):
+        run_experiment("chirp", tmp_path, seed)
+        assert (tmp_path / "chirp.mcap").read_text() == f"of seed {seed}"
 
 
 def test_bands_that_a_motion_does_not_excite_are_not_told():
