@@ -28,6 +28,7 @@ from omsm_ros.protocols.chrocodile_readings import (
     TRIGGER_DELAYED,
     TRIGGER_LOST,
     ProbeReading,
+    check_selection,
     counts_of,
     distance_of,
 )
@@ -94,11 +95,13 @@ class ChrocodileSettings(BlockSettings):
                 )
         if sorted(self.encoders) != [0, 1, 2, 3, 4]:
             raise ConfigurationError(f"encoders {self.encoders!r}, expected 0 to 4, each once")
-        if self.signals and SAMPLE_COUNTER not in self.signals:
-            raise ConfigurationError(
-                f"signals {self.signals!r} lack {SAMPLE_COUNTER}, the sample counter: without "
-                "it lost samples would not show"
-            )
+        if self.signals:
+            check_selection(self.signals, self.latched)
+
+    @property
+    def latched(self) -> tuple[int, ...]:
+        """Signals that the axes are read from."""
+        return sum(LATCHES[self.latch], ()) if self.axes is not None else ()
 
 
 class RefusedError(DeviceError):
@@ -124,8 +127,7 @@ class Chrocodile(StreamDevice):
     ) -> None:
         settings = settings or ChrocodileSettings()
         free = settings.trigger == "free_run"
-        encoders = sum(LATCHES[settings.latch], ()) if settings.axes is not None else ()
-        selection = settings.signals or (*self.usual, *encoders)
+        selection = settings.signals or (*self.usual, *settings.latched)
         timed = self.always_timed or START_TIME in selection
         period = settings.sample_period if free else 0.0
         super().__init__(

@@ -1,13 +1,17 @@
 """Bytes of a CHRocodile in the dollar protocol → telegrams, in any portions.
 
-The sync pair also occurs in the data. So the place is kept by counting, from ``ready`` on,
-and searched only when a sync is missing where it is due. A telegram counts once the sync of
-the next one has come: bytes lost inside it would show there. What a flipped bit does to a
-value, nothing in this protocol can show.
+The sync pair also occurs in the data, in every telegram where an encoder stands at -1. So the
+place is kept by counting, from ``ready`` on, and searched only when a sync is missing where it
+is due, or what should be the sample counter leaps. Where several places could begin a
+telegram, that counter tells which does. A telegram counts once the sync of the next one has
+come: bytes lost inside it would show there. What a flipped bit does to a value, nothing in
+this protocol can show.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from dataclasses import dataclass
 
@@ -25,6 +29,8 @@ from omsm_ros.protocols.chrocodile_telegram import (
 
 # Two telegrams found in garbage belong together if no more samples than this lie between.
 _NEAR = 16
+# Of several places, one where the counter has gone on so often is believed [telegrams].
+_DEEP = 8
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -43,7 +49,7 @@ class TelegramStatistics:
 
 
 class BinaryDecoder:
-    """Bytes in any portions → telegrams; nothing raises, memory is two telegrams and a portion."""
+    """Bytes in any portions → telegrams; nothing raises, memory is a portion and 11 telegrams."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -51,12 +57,14 @@ class BinaryDecoder:
         self._due = int.from_bytes(layout.sync, "big")
         self._buffer = b""
         self._synchronised = False
+        self._counter = _Counter(layout)
         self._received = self._telegrams = self._losses = 0
 
     def reset(self, *, synchronised: bool) -> None:
         """Forget an unfinished telegram; ``synchronised``: the next byte begins one."""
         self._buffer = b""
         self._synchronised = synchronised
+        self._counter.forget()
 
     def feed(self, data: bytes) -> Records:
         """Return telegrams that ``data`` confirms, shape (n,); n may be 0."""
@@ -102,47 +110,129 @@ class BinaryDecoder:
         rest = buffer[whole * length :][:2]
         if not len(bad) and not self._layout.sync.startswith(rest):
             bad = np.array([whole])
-        if not len(bad):
-            count = whole if len(rest) == 2 else max(0, whole - 1)
+        count, after = whole - (len(rest) < 2), 0
+        if len(bad):
+            # The telegram before a missing sync is too short or too long: it is none.
+            count, after = int(bad[0]) - 1, int(bad[0] > 0)
+        count = max(0, count)
+        goes_on = self._counter.follow(records[:count])
+        if goes_on < count:
+            count, after = goes_on, 0
+        elif not len(bad):
             self._buffer = buffer[count * length :]
             return buffer[: count * length]
-        # The telegram before a missing sync is too short or too long: it is none.
-        count = max(0, int(bad[0]) - 1)
-        self._buffer = buffer[count * length + (bad[0] > 0) :]
+        self._buffer = buffer[count * length + after :]
         self._synchronised = False
         self._losses += 1
+        self._counter.forget()
         return buffer[: count * length]
 
     def _search(self) -> bool:
-        """Go to the first two telegrams in a row; keep only what may still become that."""
-        length, size = self._layout.length, len(self._buffer)
-        raw = np.frombuffer(self._buffer + bytes(2 * length), np.uint8)
+        """Go to where telegrams begin; keep only what may still become that."""
+        size = 2 * (_DEEP + 2) * self._layout.length  # all that can be open is settled in it
+        while True:
+            window = self._buffer[:size]
+            size *= 4
+            place, settled = _first_of(self._places(window), self._layout.length, len(window))
+            if place is None:
+                place = len(window) - window.endswith(self._layout.sync[:1])
+            whole = len(self._buffer) == len(window)
+            self._buffer = self._buffer[place:]
+            if settled or whole:
+                self._synchronised = settled
+                return settled
+
+    def _places(self, window: bytes) -> dict[int, int]:
+        """Return where two telegrams in a row begin, or may, and by how much they count on."""
+        length, size = self._layout.length, len(window)
+        raw = np.frombuffer(window + bytes(2 * length), np.uint8)
         first, second = self._layout.sync
         sync = (raw[:-1] == first) & (raw[1:] == second)
         starts = np.flatnonzero(sync[:size])
         starts = starts[sync[starts + length] | (starts + length + 2 > size)]
-        whole = starts + 2 * length <= size
-        found = np.flatnonzero(~whole | self._plausible(raw, starts))
-        if not len(found):
-            self._buffer = self._buffer[-1:] if self._buffer.endswith(bytes([first])) else b""
-            return False
-        self._buffer = self._buffer[starts[found[0]] :]
-        self._synchronised = bool(whole[found[0]])
-        return self._synchronised
+        steps = self._counter.steps(raw, starts)
+        found = (starts + 2 * length > size) | ((steps >= 1) & (steps <= _NEAR))
+        return dict(zip(starts[found].tolist(), steps[found].tolist(), strict=True))
 
-    def _plausible(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return where the sample counter, if there is one, goes on between two telegrams."""
-        if SAMPLE_COUNTER not in self._layout.signals:
-            return np.ones(len(starts), np.bool_)
-        index = self._layout.signals.index(SAMPLE_COUNTER)
-        kind = np.dtype(FORMATS[self._layout.types[index]])
-        place = starts + self._layout.offsets[index]
+
+def _first_of(places: dict[int, int], length: int, size: int) -> tuple[int | None, bool]:
+    """Return the first of ``places`` that begins a telegram, and whether that is settled.
+
+    places: [bytes], ascending, of ``size``: where two telegrams in a row begin, or may, and the
+    step of their counters. Of places within one telegram, the one counts from which telegrams
+    follow each other for longest; of those that go on, the one with the smallest steps.
+    """
+
+    def rank(place: int) -> tuple[float, float]:
+        """Return the least and the greatest rank that ``place`` may have."""
+        steps = 0
+        for here in range(place, place + _DEEP * length, length):
+            if here not in places:
+                return here, here if here + 2 <= size else math.inf
+            if here + 2 * length > size:
+                return here, math.inf
+            steps += places[here]
+        return size + 1 / steps, size + 1 / steps
+
+    candidates = list(places)
+    for i, place in enumerate(candidates):
+        if place + 2 * length > size:
+            return place, False
+        least, most = rank(place)
+        rivals = itertools.takewhile((place + length).__gt__, candidates[i + 1 :])
+        others = [rank(rival) for rival in rivals]
+        if all(high <= least for _, high in others):
+            return place, True
+        if not any(low > most for low, _ in others):
+            return place, False
+    return None, False
+
+
+class _Counter:
+    """Follows the sample counter of telegrams, where they have one."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._length = layout.length
+        self._has_one = SAMPLE_COUNTER in layout.signals
+        if self._has_one:
+            index = layout.signals.index(SAMPLE_COUNTER)
+            self._kind = np.dtype(FORMATS[layout.types[index]])
+            self._offset = layout.offsets[index]
+            self._modulus = 2 ** (8 * self._kind.itemsize)
+        self._last: int | None = None
+        self._step = 1
+
+    def forget(self) -> None:
+        """Follow from the next telegram on."""
+        self._last, self._step = None, 1
+
+    def steps(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return its steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
+        if not self._has_one:
+            return np.ones(len(starts), np.intp)
+        place = starts + self._offset
         here, after = (
-            raw[at[:, np.newaxis] + np.arange(kind.itemsize)].copy().view(kind)[:, 0].astype(int)
-            for at in (place, place + self._layout.length)
+            raw[at[:, np.newaxis] + np.arange(self._kind.itemsize)]
+            .copy()
+            .view(self._kind)[:, 0]
+            .astype(np.intp)
+            for at in (place, place + self._length)
         )
-        step = (after - here) % 2 ** (8 * kind.itemsize)
-        return np.asarray((step >= 1) & (step <= _NEAR))
+        return np.asarray((after - here) % self._modulus)
+
+    def follow(self, records: Records) -> int:
+        """Return how many of ``records`` (n,) come before its first leap: n = it made none.
+
+        It may stand, and a step that comes twice is no leap.
+        """
+        if not self._has_one or not len(records):
+            return len(records)
+        now = records[str(SAMPLE_COUNTER)].astype(int)
+        first = now[0] - self._step if self._last is None else self._last
+        steps = np.diff(now, prepend=first) % self._modulus
+        leaps = (steps > _NEAR) & (np.diff(steps, prepend=self._step) != 0)
+        self._last, self._step = int(now[-1]), int(steps[-1])
+        return int(np.argmax(leaps)) if leaps.any() else len(records)
 
 
 class LineDecoder:

@@ -19,6 +19,7 @@ from omsm_ros.protocols.chrocodile_telegram import (
     FLAGS,
     INTENSITY,
     INTENSITY_16,
+    SAMPLE_COUNTER,
     Records,
 )
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
@@ -34,6 +35,20 @@ LATCHES = {
 }
 # The device's encoders are 32 bits wide.
 ENCODER_RANGE = 2**32
+
+
+def check_selection(signals: Sequence[int], encoders: Sequence[int]) -> None:
+    """Raise ConfigurationError unless ``signals`` hold the counter and what axes are read from."""
+    if SAMPLE_COUNTER not in signals:
+        raise ConfigurationError(
+            f"signals {signals!r} lack {SAMPLE_COUNTER}, the sample counter: without it lost "
+            "samples would not show"
+        )
+    if missing := sorted({*encoders} - {*signals}):
+        raise ConfigurationError(
+            f"signals {signals!r} lack {missing!r}, the encoders of the axes: add them, or "
+            "leave `encoders` empty"
+        )
 
 
 @dataclass(frozen=True, slots=True)

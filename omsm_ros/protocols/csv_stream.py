@@ -2,8 +2,8 @@
 
 Separated by commas or blanks, so what LinuxCNC's ``halsampler -t`` pipes out is read too (the
 sample's number first, then the pins in their order). Axes are counts, with decimals if they
-have any; distance is in nanometres, time in nanoseconds. A line that holds anything else, or
-another number of columns, is no sample.
+have any; distance is in nanometres, time in nanoseconds. Lines end with LF, CR or both. One that
+holds anything else, or another number of columns, is no sample.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class CsvDecoder:
     def feed(self, data: bytes) -> NDArray[np.void]:
         """Return the rows completed by ``data``, shape (n,)."""
         self._received += len(data)
-        *lines, tail = (self._tail + data).split(b"\n")
+        *lines, tail = (self._tail + data).replace(b"\r", b"\n").split(b"\n")
         self._tail = tail[: MAX_LINE_BYTES + 1]
         rows = [row for line in lines if (row := self._row(line)) is not None]
         self._lines += len(rows)

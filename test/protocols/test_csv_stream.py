@@ -35,6 +35,15 @@ def test_what_halsampler_pipes_out() -> None:
     assert decoder.statistics.malformed == 1
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_any_line_end(end: bytes) -> None:
+    wire = b"".join(encode_lines(rows(5))).replace(b"\n", end)
+    decoder = CsvDecoder()
+    found = np.concatenate([decoder.feed(wire[i : i + 1]) for i in range(len(wire))])
+    assert found.tobytes() == rows(5).tobytes()
+    assert decoder.statistics.malformed == 0
+
+
 @given(st.integers(1, 8), st.data())
 def test_any_split_gives_the_same_rows(count: int, data: st.DataObject) -> None:
     wire = b"".join(encode_lines(rows(count)))
