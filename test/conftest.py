@@ -5,6 +5,7 @@ And their order: several processes share the tests, a file each, and files with 
 
 import signal
 
+import hypothesis
 import pytest
 
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -14,7 +15,13 @@ from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
 
 def pytest_configure():
-    """A shell in the background ignores SIGINT, and so would every node that a test starts."""
+    """What a busy computer and a shell in the background would make of the tests.
+
+    An example of hypothesis would have 200 ms; each test has its time-out. Such a shell ignores
+    SIGINT, and so would every node that a test starts.
+    """
+    hypothesis.settings.register_profile("whole tests are timed", deadline=None)
+    hypothesis.settings.load_profile("whole tests are timed")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

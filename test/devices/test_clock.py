@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from omsm_ros.devices.clock import DeviceClock
@@ -102,7 +102,6 @@ def test_stamps_between_arrivals_neither_jump_nor_bunch() -> None:
     np.testing.assert_allclose(np.diff(inside), MS, rtol=1e-3)
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 2**40), st.integers(-(2**40), 2**40), st.booleans()), min_size=1

@@ -147,7 +147,6 @@ def sequences(examples: int) -> Any:
         derandomize=True,
         phases=[Phase.generate],  # a story is not made shorter: that takes minutes
         max_examples=examples,
-        deadline=None,
         suppress_health_check=[HealthCheck.function_scoped_fixture],
     )
 

@@ -109,7 +109,6 @@ def _all_refused_or_right(
 ) -> None:
     @settings(
         max_examples=cases,
-        deadline=None,
         derandomize=derandomize,
         database=None,
         suppress_health_check=list(HealthCheck),

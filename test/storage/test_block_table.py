@@ -57,7 +57,7 @@ def joined(blocks: Sequence[Block]) -> dict[str, np.ndarray]:
     }
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     samples=st.integers(1, 9),
     frame=st.text("abc", max_size=9),

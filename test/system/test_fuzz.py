@@ -86,7 +86,6 @@ CALIBRATIONS = st.fixed_dictionaries(
     },
 )
 FUZZ = {
-    "deadline": None,
     "database": None,
     "suppress_health_check": list(HealthCheck),
     "derandomize": True,

@@ -155,7 +155,7 @@ def test_an_impossible_period_is_named(period: float) -> None:
 modes = st.tuples(st.floats(5.0, 200.0), st.floats(0.02, 1.0))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     poles=st.lists(modes, min_size=1, max_size=3),
     zeros=st.lists(modes, max_size=1),

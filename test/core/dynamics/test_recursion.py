@@ -50,7 +50,7 @@ def test_a_start_at_rest_in_moving_data_would_be_seen() -> None:
     assert abs(response - steady)[-1] < 1e-12
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(cuts=st.lists(st.integers(1, 499), max_size=12))
 def test_cuts_do_not_change_a_bit(cuts: list[int]) -> None:
     digital = discretise(LATE, 1e-3)

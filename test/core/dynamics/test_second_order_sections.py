@@ -37,7 +37,7 @@ def roots(largest: float, most: int) -> st.SearchStrategy[np.ndarray]:
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(zeros=roots(3.0, 6), poles=roots(0.98, 6), gain=st.floats(0.001, 5) | st.floats(-5, -0.001))
 def test_sections_multiply_to_the_ratio_of_the_roots(
     zeros: np.ndarray, poles: np.ndarray, gain: float

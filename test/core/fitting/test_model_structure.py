@@ -17,7 +17,7 @@ def random_shape(scaled, seed):
     return shape
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(structure=st.sampled_from(EVERY), seed=st.integers(0, 10_000))
 def test_every_shape_is_stable(structure, seed):
     scaled = Scaled(structure, 300.0)
@@ -25,7 +25,7 @@ def test_every_shape_is_stable(structure, seed):
     assert scaled.transfer_function(random_shape(scaled, seed), numerator).is_stable
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(structure=st.sampled_from(EVERY), seed=st.integers(0, 10_000))
 def test_the_lag_is_the_response_without_its_numerator(structure, seed):
     scaled = Scaled(structure, 300.0)

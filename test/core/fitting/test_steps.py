@@ -25,7 +25,7 @@ def staircase(heights, period=1e-3, dwell=0.4, rise=0.02, noise=0.4e-9, seed=0):
     return z + np.random.default_rng(seed).normal(0, noise, samples)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     heights=st.lists(
         st.floats(0.5e-6, 20e-6).flatmap(lambda h: st.sampled_from([h, -h])),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from omsm_ros.core.samples.even_selection import EvenSelection
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     total=st.integers(0, 400),
     cuts=st.lists(st.integers(0, 400), max_size=8),

@@ -152,7 +152,7 @@ AXES = [run(0, 10, 80, 0.01), run(0, 120, 60, 0.12), run(1, 0, 90, 9.0), run(2, 
 DISTANCE = [run(0, 0, 100, 0.0), run(0, 110, 90, 0.11), run(1, 3, 97, 9.003), run(2, 0, 60, 20.0)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     cuts=st.tuples(st.lists(st.integers(1, 99)), st.lists(st.integers(1, 99))),
     turns=st.lists(st.booleans(), min_size=300, max_size=300),
