@@ -33,7 +33,7 @@ def aside():
 
 
 def soon(true):
-    end = time.monotonic() + 5.0
+    end = time.monotonic() + 30.0
     while not true() and time.monotonic() < end:
         time.sleep(0.05)
     return true()
