@@ -5,7 +5,9 @@ from __future__ import annotations
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.light import Light
 from omsm_ros.core.samples.recent import Flow, RecentIncrease
+from omsm_ros.core.samples.slips import Slip
 from omsm_ros.core.samples.throughput import LoadMeter
+from omsm_ros.core.verification.live_offset import LiveOffset
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 
 # Without a block for so long, and for as long as several last, the motion has paused [s].
@@ -66,8 +68,17 @@ class CorrectionState:
             self.load.block(self._oldest_ns, now_ns)
         self._oldest_ns = 0
 
-    def report(self, corrector: Corrector | None, now: float, cpu: float) -> Report:
-        """Weigh the state; ``corrector`` is None without a calibration."""
+    def report(
+        self,
+        corrector: Corrector | None,
+        now: float,
+        cpu: float,
+        motion: LiveOffset | None = None,
+    ) -> Report:
+        """Weigh the state; ``corrector`` is None without a calibration.
+
+        motion: what it says of the counters of two devices
+        """
         report = Report("correcting", {"clouds_published": self.published})
         for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
             report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
@@ -83,6 +94,8 @@ class CorrectionState:
         report.values["pairs_held"] = corrector.held
         if slip.samples:
             report.add(ERROR, f"not corrected: {slip}")
+        if motion is not None:
+            _add_motion(report, slip, motion)
         report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}
         self._add_losses(report, self._account(report, corrector), now)
         waited = self.load.worst_ms()
@@ -129,3 +142,20 @@ class CorrectionState:
                 report.add(STALE, f"no sample of {stream} yet")
             elif silent > patience:
                 report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
+
+
+def _add_motion(report: Report, slip: Slip, motion: LiveOffset) -> None:
+    """Enter what a motion before a fixed target said of the counts, and hold the stamps to it."""
+    told = motion.established
+    report.values["motion_offset_samples"] = None if told is None else told.samples
+    if told is None:
+        return
+    if told.samples:
+        report.add(
+            ERROR,
+            f"the motion says that the counts are {told.samples} samples apart (± "
+            f"{told.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
+            f"counter_offset {motion.in_use + told.samples}, or identify anew if the lag changed",
+        )
+    elif slip.samples:
+        report.add(ERROR, "but the motion says that equal counts are one trigger: a link is late")

@@ -20,6 +20,7 @@ from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.merging import consecutive
+from omsm_ros.core.verification.live_offset import LiveOffset
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.nodes.aside import Aside
@@ -56,6 +57,7 @@ class CorrectorNode(ManagedNode):
         self._nominal = load_surface(nominal) if nominal else None
         self._frame = self.values["workpiece_frame"]
         self._corrector: Corrector | None = None
+        self._motion: LiveOffset | None = None
         self._probe: dict[str, object] = {}
         self._foreign = ""
         self._overridden: tuple[str, ...] = ()
@@ -112,6 +114,7 @@ class CorrectorNode(ManagedNode):
         for reason in reasons:
             self.get_logger().warning(f"overridden: {reason}")
         self._corrector, self._foreign, self._overridden = corrector, "", reasons
+        self._motion = LiveOffset(calibration, self._options.trigger.counter_offset)
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
 
     def _on_probe(self, message: String, _: MessageInfo) -> None:
@@ -187,7 +190,10 @@ class CorrectorNode(ManagedNode):
             return
         convert = conversions.axis_block if stream == "axes" else conversions.distance_block
         try:
-            self._waiting[stream].append(convert(message))
+            block = convert(message)
+            self._waiting[stream].append(block)
+            if self._motion:
+                self._motion.add(block)
         except OmsmError as err:
             self._refuse(stream, samples, err)
 
@@ -231,7 +237,10 @@ class CorrectorNode(ManagedNode):
 
     def report(self) -> Report:
         """Return the account, and what is wrong with it now."""
-        report = self._state.report(self._corrector, time.monotonic(), time.process_time())
+        if self._motion and self._corrector and not self._corrector.slips.one_driver:
+            self._motion.judge()
+        now, cpu = time.monotonic(), time.process_time()
+        report = self._state.report(self._corrector, now, cpu, self._motion)
         report.values["calibration"] = self._in_force_id()
         # Before there is a point, all that is uncertain would make nothing.
         if self._state.published and self._corrector and self._topic.calibration is not None:

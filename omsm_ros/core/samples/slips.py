@@ -173,6 +173,11 @@ class SlipWatch:
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
     @property
+    def one_driver(self) -> bool:
+        """Whether both streams carry the same stamps: then one device latches both."""
+        return self._common
+
+    @property
     def state(self) -> Slip:
         """What the stamps said last."""
         if self._state.samples:
@@ -342,8 +347,3 @@ def _to_be_learnt(wander: FloatArray) -> float:
     if len(wander) <= 2:
         return 0.0
     return _END_OF_LINE * spread_about_median(np.diff(wander)) * math.sqrt(len(wander))
-
-
-def _skews(rows: FloatArray, period_ns: float) -> FloatArray:
-    """Return the skews [samples] of stamps (n, 5)."""
-    return np.asarray(rows[:, 1] / period_ns)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
@@ -86,11 +85,12 @@ def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArra
 def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -> FloatArray:
     """Return the share of the distance's variance that Z leaves, by offset -most … most."""
     weight = ok.astype(np.float64)
+    size = 1 << (len(z) + most).bit_length()
+    wanted = np.arange(-most, most + 1)
 
     def lagged(a: FloatArray, b: FloatArray) -> FloatArray:
-        whole = correlate(a, b, mode="full", method="fft")
-        middle = len(b) - 1
-        return np.asarray(whole[middle - most : middle + most + 1])
+        product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
+        return np.asarray(np.fft.irfft(product, size)[wanted])
 
     inside = np.ones(len(z))
     n, sz, szz = lagged(inside, weight), lagged(z, weight), lagged(z * z, weight)
