@@ -3,8 +3,8 @@
 The sync pair also occurs in the data, in every telegram where an encoder stands at -1. So the
 place is kept by counting, from ``ready`` on, and searched only when a sync is missing where it
 is due, or what should be the sample counter leaps. Where several places could begin a
-telegram, that counter tells which does. A telegram counts once the sync of the next one has
-come: bytes lost inside it would show there. What a flipped bit does to a value, nothing in
+telegram, that counter tells which does. A telegram counts once sync and counter of the next one
+have come: bytes lost inside it would show there. What a flipped bit does to a value, nothing in
 this protocol can show.
 """
 
@@ -58,12 +58,15 @@ class BinaryDecoder:
         self._buffer = b""
         self._synchronised = False
         self._counter = _Counter(layout)
+        # A telegram before a leap: it counts if the next one is found in its place.
+        self._doubtful = b""
+        self._in_place = False
         self._received = self._telegrams = self._losses = 0
 
     def reset(self, *, synchronised: bool) -> None:
         """Forget an unfinished telegram; ``synchronised``: the next byte begins one."""
-        self._buffer = b""
-        self._synchronised = synchronised
+        self._buffer = self._doubtful = b""
+        self._synchronised, self._in_place = synchronised, False
         self._counter.forget()
 
     def feed(self, data: bytes) -> Records:
@@ -72,7 +75,7 @@ class BinaryDecoder:
         self._buffer += data
         parts = []
         while self._synchronised or self._search():
-            parts.append(self._take())
+            parts += [self._cleared(), self._take()]
             if self._synchronised:
                 break
         found = np.frombuffer(b"".join(parts), self._dtype)
@@ -80,26 +83,33 @@ class BinaryDecoder:
         return found
 
     def settle(self) -> Records:
-        """Return the last telegram, if whole and nothing came after it; shape (0,) or (1,)."""
+        """Return the last telegram, if whole and nothing came after it; shape (n,), n 0 to 2."""
         whole = len(self._buffer) == self._layout.length
-        if not (self._synchronised and whole and self._buffer.startswith(self._layout.sync)):
+        placed = self._synchronised or self._in_place
+        if not (placed and whole and self._buffer.startswith(self._layout.sync)):
             return np.empty(0, self._dtype)
-        found = np.frombuffer(self._buffer, self._dtype)
-        self._buffer = b""
-        self._telegrams += 1
+        found = np.frombuffer(self._cleared() + self._buffer, self._dtype)
+        self._buffer, self._synchronised = b"", True
+        self._counter.forget()
+        self._telegrams += len(found)
         return found
 
     @property
     def statistics(self) -> TelegramStatistics:
         """Return what became of every byte."""
-        decoded = self._telegrams * self._layout.length
+        decoded, waits = self._telegrams * self._layout.length, len(self._buffer + self._doubtful)
         return TelegramStatistics(
             bytes_received=self._received,
-            bytes_discarded=self._received - decoded - len(self._buffer),
-            bytes_pending=len(self._buffer),
+            bytes_discarded=self._received - decoded - waits,
+            bytes_pending=waits,
             telegrams=self._telegrams,
             losses_of_sync=self._losses,
         )
+
+    def _cleared(self) -> bytes:
+        """Return the telegram in doubt, for the next one is in its place."""
+        cleared, self._doubtful, self._in_place = self._doubtful, b"", False
+        return cleared
 
     def _take(self) -> bytes:
         """Return telegrams up to the last one whose successor has begun, or to a missing sync."""
@@ -107,21 +117,22 @@ class BinaryDecoder:
         whole = len(buffer) // length
         records = np.frombuffer(buffer, self._dtype, whole)
         bad = np.flatnonzero(records["sync"] != self._due)
-        rest = buffer[whole * length :][:2]
-        if not len(bad) and not self._layout.sync.startswith(rest):
+        rest = buffer[whole * length :]
+        if not len(bad) and not self._layout.sync.startswith(rest[:2]):
             bad = np.array([whole])
-        count, after = whole - (len(rest) < 2), 0
-        if len(bad):
-            # The telegram before a missing sync is too short or too long: it is none.
-            count, after = int(bad[0]) - 1, int(bad[0] > 0)
-        count = max(0, count)
-        goes_on = self._counter.follow(records[:count])
-        if goes_on < count:
-            count, after = goes_on, 0
-        elif not len(bad):
+        # The telegram before a missing sync is too short or too long: it is none.
+        begun = int(bad[0]) if len(bad) else whole + (len(rest) >= self._counter.needs)
+        count = max(0, begun - 1)
+        leap = self._counter.leap(buffer, begun, count)
+        if leap == begun and not len(bad):
             self._buffer = buffer[count * length :]
             return buffer[: count * length]
-        self._buffer = buffer[count * length + after :]
+        if leap < begun:
+            count, after = max(0, leap - 1), leap * length
+            self._doubtful, self._in_place = buffer[count * length : after], True
+        else:
+            after = count * length + int(bad[0] > 0)
+        self._buffer = buffer[after:]
         self._synchronised = False
         self._losses += 1
         self._counter.forget()
@@ -138,6 +149,8 @@ class BinaryDecoder:
                 place = len(window) - window.endswith(self._layout.sync[:1])
             whole = len(self._buffer) == len(window)
             self._buffer = self._buffer[place:]
+            if place:
+                self._doubtful, self._in_place = b"", False
             if settled or whole:
                 self._synchronised = settled
                 return settled
@@ -194,11 +207,13 @@ class _Counter:
     def __init__(self, layout: Layout) -> None:
         self._length = layout.length
         self._has_one = SAMPLE_COUNTER in layout.signals
+        self.needs = len(layout.sync)
         if self._has_one:
             index = layout.signals.index(SAMPLE_COUNTER)
             self._kind = np.dtype(FORMATS[layout.types[index]])
             self._offset = layout.offsets[index]
             self._modulus = 2 ** (8 * self._kind.itemsize)
+            self.needs = self._offset + self._kind.itemsize
         self._last: int | None = None
         self._step = 1
 
@@ -210,29 +225,28 @@ class _Counter:
         """Return its steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
         if not self._has_one:
             return np.ones(len(starts), np.intp)
-        place = starts + self._offset
-        here, after = (
-            raw[at[:, np.newaxis] + np.arange(self._kind.itemsize)]
-            .copy()
-            .view(self._kind)[:, 0]
-            .astype(np.intp)
-            for at in (place, place + self._length)
-        )
+        here, after = (self._read(raw, places) for places in (starts, starts + self._length))
         return np.asarray((after - here) % self._modulus)
 
-    def follow(self, records: Records) -> int:
-        """Return how many of ``records`` (n,) come before its first leap: n = it made none.
+    def leap(self, wire: bytes, begun: int, count: int) -> int:
+        """Return at which of the ``begun`` telegrams in ``wire`` it leaps first; ``begun`` = none.
 
-        It may stand, and a step that comes twice is no leap.
+        It may stand, and a step that comes twice is no leap. Those before ``count`` are done with.
         """
-        if not self._has_one or not len(records):
-            return len(records)
-        now = records[str(SAMPLE_COUNTER)].astype(int)
+        if not self._has_one or not begun:
+            return begun
+        now = self._read(np.frombuffer(wire, np.uint8), self._length * np.arange(begun))
         first = now[0] - self._step if self._last is None else self._last
         steps = np.diff(now, prepend=first) % self._modulus
         leaps = (steps > _NEAR) & (np.diff(steps, prepend=self._step) != 0)
-        self._last, self._step = int(now[-1]), int(steps[-1])
-        return int(np.argmax(leaps)) if leaps.any() else len(records)
+        if count:
+            self._last, self._step = int(now[count - 1]), int(steps[count - 1])
+        return int(np.argmax(leaps)) if leaps.any() else begun
+
+    def _read(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the counters (n,) of telegrams in ``raw`` at ``starts`` (n,)."""
+        places = (starts + self._offset)[:, np.newaxis] + np.arange(self._kind.itemsize)
+        return raw[places].view(self._kind)[:, 0].astype(np.intp)
 
 
 class LineDecoder:
