@@ -58,7 +58,7 @@ class Declared:
         try:
             for err in self._wrong.values():
                 raise err
-            self._check_known([name for name in self._given if not name.startswith(_QOS_PREFIX)])
+            self.check_known([name for name in self._given if not name.startswith(_QOS_PREFIX)])
             return {
                 name: parameter.checked(self._node.get_parameter(name).value)
                 for name, parameter in self._parameters.items()
@@ -68,9 +68,10 @@ class Declared:
 
     def check_overrides(self) -> None:
         """Raise ConfigurationError for a qos_overrides.* of a topic that the node does not have."""
-        self._check_known([name for name in self._given if name.startswith(_QOS_PREFIX)])
+        self.check_known([name for name in self._given if name.startswith(_QOS_PREFIX)])
 
-    def _check_known(self, names: Sequence[str]) -> None:
+    def check_known(self, names: Sequence[str]) -> None:
+        """Raise ConfigurationError for one that the node does not have, with the nearest one."""
         for name in names:
             if not self._node.has_parameter(name):
                 near = difflib.get_close_matches(name, self._parameters, 1)

@@ -18,13 +18,14 @@ from enum import Enum
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from omsm_ros.errors import OmsmError, one_line
+from omsm_ros.errors import ConfigurationError, OmsmError, one_line
 from omsm_ros.nodes import topics
 from omsm_ros.nodes.declared import Declared
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, survive
@@ -113,6 +114,16 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._outputs.append(made)
         undo.callback(self._outputs.remove, made)
         return made
+
+    # Parameters.
+
+    def set_parameters_atomically(self, parameter_list: list[Any]) -> SetParametersResult:
+        """Set all or none; rclpy itself does not say which one it does not know."""
+        try:
+            self._declared.check_known([parameter.name for parameter in parameter_list])
+        except ConfigurationError as err:
+            return SetParametersResult(successful=False, reason=str(err))
+        return super().set_parameters_atomically(parameter_list)
 
     # Transitions.
 

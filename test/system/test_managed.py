@@ -79,6 +79,7 @@ def test_a_parameter_acts_or_is_refused_with_the_reason(cell, true_calibration):
         ("lateral_lag", float("nan"), "lateral_lag"),
         ("calibration", "/etc/passwd", "deactivate and cleanup"),
         ("autostart", False, "read"),
+        ("calibraton", "x.json", "did you mean 'calibration'"),
     ):
         answer = put(cell, "corrector", name, value)
         assert not answer.successful
