@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def established_offset(
         lag=calibration.dynamics.low_frequency_delay / period,
         lag_uncertainty=calibration.low_frequency_delay_uncertainty / period,
     )
-    return CounterOffset(guess + found.samples, found.fraction, found.uncertainty)
+    return replace(found, samples=guess + found.samples)
 
 
 def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) -> int:

@@ -35,11 +35,13 @@ class CounterOffset:
     """samples: added to the distance's count, it gives the axes' count
 
     fraction: of a sample that the fit leaves, after the known lag;  uncertainty: of it (k = 1)
+    gain: by how much the distance falls as Z rises
     """
 
     samples: int
     fraction: float
     uncertainty: float
+    gain: float
 
 
 def counter_offset(
@@ -147,7 +149,7 @@ def _refined(
             f"the counters differ by {found:.2f} ± {uncertainty:.2f} samples, which is no whole "
             "number; move Z faster before a fixed target, state the lag, or state counter_offset"
         )
-    return CounterOffset(whole, found - whole, uncertainty)
+    return CounterOffset(whole, found - whole, uncertainty, float(gain))
 
 
 def _correlation_length(residual: FloatArray) -> float:

@@ -19,6 +19,9 @@ from omsm_ros.errors import DataError
 _SPAN_S, _MOST_SAMPLES = 4.0, 16_384
 # Offsets are searched as far as links may be late [s].
 _SEARCH_S = 0.25
+# A surface that moves with Z, but some samples later, looks like an offset of its share of them. So
+# the distance must answer to Z as before a fixed target, to this part of the static gain.
+_SAME_GAIN = 0.01
 # Between two findings that must agree, so that one of them holds motion that the other has not [s].
 _APART_S = 1.0
 
@@ -34,6 +37,7 @@ class LiveOffset:
     def __init__(self, calibration: Calibration, in_use: int) -> None:
         self.in_use = in_use
         self.established: CounterOffset | None = None
+        self._gain = abs(calibration.static_gain)
         self._lag = calibration.dynamics.low_frequency_delay
         self._lag_uncertainty = calibration.low_frequency_delay_uncertainty
         self._axes, self._distance = _Newest(), _Newest()
@@ -72,6 +76,8 @@ class LiveOffset:
             )
         except DataError:
             return  # this motion does not tell
+        if abs(abs(found.gain) - self._gain) > _SAME_GAIN * self._gain:
+            return  # it follows a surface
         before, self._found = self._found, (end, found.samples)
         if before is not None and before[1] == found.samples:
             self.established = found

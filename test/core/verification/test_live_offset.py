@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,9 @@ from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.core.verification.live_offset import LiveOffset
 from omsm_ros.nodes.correction_state import CorrectionState
 from omsm_ros.nodes.diagnostics import ERROR
+from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+from omsm_ros.twin.scenario import Scenario, step_test_of
 
 N, BLOCK, PERIOD, NOISE = 8000, 50, 1e-3, 10e-9
 G = Plant().dynamics
@@ -44,14 +48,15 @@ def motion(kind: str) -> FloatArray:
 def blocks(z: FloatArray, slip: int, *, late: float = 0.0, followed: float = 0.0) -> Blocks:
     """Both streams: equal counts mean triggers ``slip`` apart, axes are stamped ``late`` [s].
 
-    followed: share of the motion of Z that the surface makes, too
+    followed: share of the motion of Z that the surface makes, too, 25 samples later
     """
     random, made = np.random.default_rng(4), []
     still = np.zeros(BLOCK)
     for first in range(500, N, BLOCK):
         k = first + np.arange(BLOCK)
-        seen = (1 - followed) * np.interp(k + slip - LAG, np.arange(len(z)), z)
-        distance = 50e-6 - seen + random.normal(0.0, NOISE, BLOCK)
+        at = np.arange(len(z))
+        seen = np.interp(k + slip - LAG, at, z) - followed * np.interp(k + slip - 25, at, z)
+        distance = 50e-6 - PAPER_STATIC_GAIN * seen + random.normal(0.0, NOISE, BLOCK)
         when, stamp = first * PERIOD, {"first_sample": first, "sample_period": PERIOD}
         axes = AxisBlock(
             stamp_ns=round((when + late) * 1e9), x=still, y=still, z=z[k], b=still, c=still, **stamp
@@ -82,6 +87,22 @@ def test_a_motion_before_the_target_tells_the_offset(kind: str, slip: int) -> No
     assert abs(found.fraction) < 0.2
 
 
+@pytest.mark.parametrize("slip", [0, -4])
+def test_the_papers_step_test_tells_it(slip: int) -> None:
+    came = [
+        (
+            replace(axes, first_sample=axes.first_sample + 4 + slip),
+            replace(d, first_sample=d.first_sample + 4),
+        )
+        for axes, d in blocks_of(step_test_of(Scenario(seed=3)))
+    ]
+    found = watched(came).established
+    assert found is not None
+    assert found.samples == slip
+    assert abs(found.fraction) < 0.02
+    assert abs(found.gain / PAPER_STATIC_GAIN - 1) < 1e-3
+
+
 def test_an_offset_that_is_stated_is_none_any_more() -> None:
     found = watched(blocks(motion("chirp"), 3), in_use=3).established
     assert found is not None
@@ -89,7 +110,8 @@ def test_an_offset_that_is_stated_is_none_any_more() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "followed"), [("rest", 0.0), ("sine", 0.0), ("chirp", 0.97), ("steps", 1.3)]
+    ("kind", "followed"),
+    [("rest", 0.0), ("sine", 0.0), ("chirp", 0.97), ("steps", 1.3), ("steps", 0.1)],
 )
 def test_a_motion_that_does_not_tell_establishes_nothing(kind: str, followed: float) -> None:
     assert watched(blocks(motion(kind), 3, followed=followed)).established is None
