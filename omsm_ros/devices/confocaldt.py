@@ -91,6 +91,8 @@ class ConfocalDtDevice(StreamDevice):
     as one lost sample, a silence as a restart.
     """
 
+    described_by = "`signals` (what a frame holds)"
+
     def __init__(
         self,
         transport: Transport,

@@ -36,6 +36,8 @@ class CsvSettings(BlockSettings):
 class CsvStreamDevice(StreamDevice):
     """Reads lines; the sender needs no setting up."""
 
+    described_by = "`columns` (what a line holds)"
+
     def __init__(
         self,
         transport: Transport,

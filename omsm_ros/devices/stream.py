@@ -61,7 +61,11 @@ class StreamDevice:
     A model fills in ``_prepare`` (set it up), ``_decode`` and ``_rest`` (bytes → samples) and
     ``_listen_in`` (is it still there?). The trigger count lives on over ``close`` and
     ``open``, so what a lost connection cost shows up as a gap.
+
+    described_by: the parameter that tells what the stream holds, where the device cannot
     """
+
+    described_by = ""
 
     def __init__(
         self,
@@ -203,9 +207,10 @@ class StreamDevice:
         unread: bytes that came since the last sample, an idle line's left out
         """
         if silent > UNREADABLE_S and unread:
+            described = f"{self.described_by}, " if self.described_by else ""
             raise NoSamplesError(
                 f"{self._transport.name} sends bytes ({unread} in {silent:.1f} s), but no samples "
-                "of this device; check the baud rate and what is connected"
+                f"of this device; check {described}the baud rate and what is connected"
             )
 
     def _read_answer(self, said: bytes, unanswered: Callable[[bytes], DeviceError]) -> bytes:

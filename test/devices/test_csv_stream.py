@@ -73,12 +73,18 @@ class Banner(Instrument):
         return [b"\xff\x12login:"] * len(measured)
 
 
-@pytest.mark.parametrize("device", [CsvStreamDevice, GenericStreamDevice])
-def test_bytes_that_are_no_samples_are_told(bench: Any, device: Any) -> None:
+@pytest.mark.parametrize(
+    ("device", "check"),
+    [
+        (CsvStreamDevice, "`columns` (what a line holds), the baud rate and what is connected"),
+        (GenericStreamDevice, "the baud rate and what is connected"),
+    ],
+)
+def test_bytes_that_are_no_samples_are_told(bench: Any, device: Any, check: str) -> None:
     run = bench(Banner, device, None)
     run.run(4.0)
     assert run.delivered == 0
-    assert "no samples of this device; check the baud rate and what is connected" in run.troubles[0]
+    assert f"no samples of this device; check {check}" in run.troubles[0]
 
 
 class Idle(Instrument):

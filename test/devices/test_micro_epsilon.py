@@ -175,7 +175,7 @@ def test_a_wrong_baud_rate_is_no_sample_and_is_told(bench: Any) -> None:
     run = bench(Garbled, ConfocalDtDevice, ConfocalDtSettings())
     run.run(5.0)
     assert run.delivered == 0
-    assert "baud rate" in run.troubles[0]
+    assert "`signals` (what a frame holds), the baud rate" in run.troubles[0]
 
 
 # CapaNCDT.
