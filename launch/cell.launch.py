@@ -5,12 +5,14 @@ ros2 launch omsm_ros cell.launch.py emulated:=true namespace:=cell2 record:=scan
 """
 
 import os
+from difflib import get_close_matches
 from pathlib import Path
 from zlib import crc32
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -43,6 +45,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def cell(context: LaunchContext) -> list[Node]:
     """The nodes that the arguments ask for."""
+    warn_of_others(context.argv)
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
     nodes = []
@@ -64,6 +67,15 @@ def cell(context: LaunchContext) -> list[Node]:
     if given["rviz"] == "true":
         nodes.append(rviz(given["namespace"]))
     return nodes
+
+
+def warn_of_others(arguments: list[str]) -> None:
+    """Name those of the command line that nobody takes; launch passes over them in silence."""
+    for name in (text.split(":=")[0] for text in arguments):
+        if name not in ARGUMENTS:
+            near = get_close_matches(name, ARGUMENTS, 1)
+            hint = f"did you mean {near[0]}:=?" if near else "--show-args tells them all"
+            get_logger("omsm_ros").warning(f"cell.launch.py has no argument {name!r}; {hint}")
 
 
 def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Node:

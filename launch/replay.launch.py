@@ -56,7 +56,9 @@ def generate_launch_description() -> LaunchDescription:
                 "bag": _text("bag"),
                 "cell": _text("cell"),
                 "wait_for": "corrector",
-                "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
+                "rate": ParameterValue(
+                    LaunchConfiguration("rate")
+                ),  # the player says what is wrong
             }
         ],
         output="screen",

@@ -1,6 +1,7 @@
 """Stand-ins for launch and launch_ros, which wheels lack: what a launch file would start."""
 
 import importlib.util
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -39,14 +40,21 @@ class Configuration:
         return context[self.name]
 
 
+class Context(dict):
+    """Configurations by name; ``argv`` are the arguments of the command line."""
+
+    argv = ()
+
+
 class Function:
     def __init__(self, function):
         self.function = function
 
 
 MODULES = {
-    "launch": {"LaunchContext": dict, "LaunchDescription": list},
+    "launch": {"LaunchContext": Context, "LaunchDescription": list},
     "launch.actions": {"DeclareLaunchArgument": Argument, "OpaqueFunction": Function},
+    "launch.logging": {"get_logger": logging.getLogger},
     "launch.substitutions": {"LaunchConfiguration": Configuration},
     "launch_ros": {},
     "launch_ros.actions": {"Node": Node},
@@ -64,7 +72,7 @@ def modules():
     return made
 
 
-def nodes_of(file, **given):
+def nodes_of(file, argv=(), **given):
     """The nodes that a launch file starts, with arguments; its modules must be the stand-ins."""
     spec = importlib.util.spec_from_file_location("launched", ROOT / "launch" / file)
     module = importlib.util.module_from_spec(spec)
@@ -72,4 +80,6 @@ def nodes_of(file, **given):
     *arguments, opaque = module.generate_launch_description()
     unknown = set(given) - {argument.name for argument in arguments}
     assert not unknown, f"{file} has no arguments {sorted(unknown)}"
-    return opaque.function({argument.name: argument.default for argument in arguments} | given)
+    context = Context({argument.name: argument.default for argument in arguments} | given)
+    context.argv = [*argv, *(f"{name}:={value}" for name, value in given.items())]
+    return opaque.function(context)

@@ -86,6 +86,20 @@ def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
     assert b"has ended" in late.stderr
 
 
+@pytest.mark.parametrize(
+    ("argument", "hint"),
+    [("recrod:=scan.mcap", "did you mean record:=?"), ("xyz:=1", "--show-args tells them all")],
+)
+def test_an_argument_that_nobody_takes_is_told(launch, caplog, argument, hint):
+    """Else a scan would not be recorded, or a real device be driven, for a letter."""
+    launch(argv=[argument])
+    (said,) = caplog.messages
+    assert f"no argument {argument.split(':=')[0]!r}; {hint}" in said
+    caplog.clear()
+    launch(record="scan.mcap")
+    assert not caplog.messages
+
+
 def test_a_folder_without_the_yaml_is_an_error(launch, tmp_path):
     with pytest.raises(FileNotFoundError, match="confocal_driver"):
         launch(params=str(tmp_path))

@@ -20,6 +20,7 @@ from typing import Any
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -56,7 +57,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
-        super().__init__(name, namespace=NAMESPACE)
+        try:
+            super().__init__(name, namespace=NAMESPACE)
+        except InvalidParameterTypeException as err:  # of one that rclpy itself has: use_sim_time
+            raise ConfigurationError(f"{name}: {err}") from err
         self.stage = Stage.UNCONFIGURED
         self.values: dict[str, Any] = {}
         self.fatal: OmsmError | None = None

@@ -60,7 +60,7 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
         node.close()
         node.destroy_node()
         rclpy.try_shutdown()
-        ending.ignore_signals()
+        _ignore_signals()
     if node.fatal is not None:
         sys.exit(_BAD_INPUT)
 
@@ -84,6 +84,7 @@ def _give_up(node: ManagedNode | None, err: Exception) -> None:
     else:  # the line is in the log already
         time.sleep(_LAST_WORDS_S if node.count_subscribers("/rosout") else 0.0)
     rclpy.try_shutdown()
+    _ignore_signals()
     sys.exit(_BAD_INPUT if known else _DEFECT)
 
 
@@ -112,11 +113,6 @@ class _Ending:
         if self.asked.is_set():
             wake()
 
-    def ignore_signals(self) -> None:
-        """Let none that is still to come spoil the exit code; Python lets go of its handlers."""
-        for number in ENDING:
-            signal.signal(number, signal.SIG_IGN)
-
     def _wait(self) -> None:
         asked = 0.0
         while True:
@@ -129,6 +125,12 @@ class _Ending:
                 self._wake()
             elif time.monotonic() - asked > _PATIENCE_S:
                 os._exit(128 + number)
+
+
+def _ignore_signals() -> None:
+    """Let none that is still to come spoil the exit code; Python lets go of its handlers."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _spin(node: ManagedNode, ending: _Ending) -> None:

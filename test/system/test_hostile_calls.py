@@ -2,6 +2,7 @@
 
 import array
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -154,6 +155,7 @@ def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small
         ("corrector", "calibration:=/dev/zero", "no regular file"),
         ("calibrator", "buffer_samples:=-7", "buffer_samples"),
         ("calibrator", "buffer_samples:=many", "buffer_samples"),
+        ("calibrator", "use_sim_time:=maybe", "use_sim_time"),
     ],
 )
 def test_a_wrong_parameter_is_one_line_and_exit_2(node, parameter, named):
@@ -167,3 +169,14 @@ def test_a_wrong_parameter_is_one_line_and_exit_2(node, parameter, named):
     line = done.stderr.strip().splitlines()[-1]
     assert named in line
     assert "Traceback" not in done.stderr
+
+
+def test_interrupts_do_not_hide_that_a_node_could_not_start():
+    """They come until the last moment, as from a launch that ends what it started."""
+    command = [sys.executable, "-m", "omsm_ros.nodes.corrector_node", "--ros-args"]
+    with subprocess.Popen([*command, "-p", "polarity:=7"], stderr=subprocess.PIPE) as node:
+        assert b"polarity" in node.stderr.readline()
+        while node.poll() is None:
+            node.send_signal(signal.SIGINT)
+            time.sleep(0.001)
+    assert node.returncode == 2
