@@ -75,6 +75,7 @@ def test_selfcal_divides_the_lag_and_correct_uses_it(capsys, tmp_path, late_pair
     assert latency["source"] == "several speeds"
     assert abs(latency["delay_s"] - 1e-4) < 3 * latency["uncertainty_s"] < 6e-6
     assert found["verdict"] == "accepted"
+    assert found["speeds_rpm"] == pytest.approx([60.0, 120.0], rel=1e-6)
     nominal = tmp_path / "mirror.yaml"
     nominal.write_text(
         "shape: off_axis_paraboloid\nparent_focal_length: 25.4e-3\noff_axis_distance: 50.8e-3\n"

@@ -108,6 +108,8 @@ def test_a_bad_band_and_a_bag_without_samples_are_one_line(folder, tmp_path, cap
     assert cli.main([*arguments, "--stop", "400", "600"]) == 2
     assert "half the sampling rate" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
+    assert cli.main(arguments) == 0
+    assert [file.name for file in (tmp_path / "o").glob("*.*ml")] == []
     with BagWriter(tmp_path / "empty.mcap", (bags.AXES_TOPIC,)):
         pass
     assert cli.main(["spectrum", str(tmp_path / "empty.mcap"), "--out", str(tmp_path / "o")]) == 2
