@@ -28,6 +28,7 @@ from omsm_ros.core.departures.survey import Judged, Survey
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
+from omsm_ros.core.fitting.order_choice import choose as choose_candidate
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.identification.model_choice import Model
@@ -255,16 +256,23 @@ def _as_fitted(term: Term, fitted: Fit) -> Term:
 
 
 def _bases(model: Model) -> list[Fit]:
-    """Return the fits that a pole may be added to: the chosen one, and the best plain one."""
-    chosen = model.chosen.fit
-    plain = _best_plain(model)
-    return [chosen] if plain is None or plain is chosen else [chosen, plain]
+    """Return the fits that a pole may be added to: the chosen one, and a plain one.
+
+    That one is chosen by the same rule: a single lag beside a relaxation has no roll-off, so its
+    band would be far too narrow at the upper end.
+    """
+    chosen, candidates = model.chosen.fit, _plain(model)
+    plain = choose_candidate(candidates).fit if candidates else chosen
+    return [chosen] if plain is chosen else [chosen, plain]
 
 
 def _best_plain(model: Model) -> Fit | None:
     """Return the best fit of a structure and its roll-off alone, if one was tried."""
-    plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
-    return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
+    return min(_plain(model), key=lambda c: c.bic).fit if _plain(model) else None
+
+
+def _plain(model: Model) -> list[Candidate]:
+    return [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
 
 
 def _with_poles(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 
-from omsm_ros.core.departures.families import DRIFT, FASTEST_CREEP_S, relaxed
+from omsm_ros.core.departures.families import CREEP, DRIFT, FASTEST_CREEP_S, relaxed
 from omsm_ros.core.departures.hidden import hidden_terms, relaxation_found, without_drift
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.dynamics.response_band import response_band
@@ -102,3 +102,13 @@ def test_the_share_of_slow_poles_is_their_partial_fraction(share):
     numerator = [1.0, share * fast + (1 - share) * slow]
     whole = TransferFunction.from_ascending(numerator, [1.0, slow + fast, slow * fast])
     assert relaxation_found(whole) == pytest.approx(abs(share), rel=1e-9)
+
+
+def test_beside_a_relaxation_lag_and_roll_off_stay_independent():
+    """With a lag alone beside it the band would close at the upper end, where nothing is known."""
+    crept = 1e-3 * (relaxed(LATE, PERIOD / 1.0) - LATE)
+    searched = search(prepare(late_record(-crept), "encoder"), model_from_start)
+    assert [term.family for term in searched.in_response] == [CREEP]
+    pole_and_zero, lag_and_roll_off = 2, 3
+    structure = searched.model.chosen.fit.structure
+    assert structure.size >= pole_and_zero + lag_and_roll_off
