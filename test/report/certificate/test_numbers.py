@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.report.certificate.reading import mode_table, shape_table, two_mass_table
+from omsm_ros.report.certificate.reading import (
+    hidden_table,
+    mode_table,
+    shape_table,
+    two_mass_table,
+)
 from omsm_ros.report.certificate.tables import order_table
 
 from .certificates import by_name, certified
@@ -89,3 +94,23 @@ class TestNumbers:
         assert texts["m2 / m1"] == "2.000 ± 0.020"
         assert texts["k2 / m1"] == "5.00 MN/(m·kg) ± 0.15 MN/(m·kg)"
         assert texts["c2 / m1"] == "80.0 N·s/(m·kg) ± 4.0 N·s/(m·kg)"
+
+
+def test_what_could_hide_has_its_own_time_or_frequency_and_the_unit_of_its_kind():
+    """A share of the motion for what follows it, a length for the rest."""
+    entries = {
+        "could_hide": [
+            {"family": "creep", "parameter": 20.0, "missed": 4e-4, "effect_on_scan_m": 11e-9},
+            {"family": "soft mode", "parameter": 8.0, "missed": 1e-3, "effect_on_scan_m": 5e-9},
+            {"family": "backlash", "missed": 3e-9, "effect_on_scan_m": 2e-9},
+        ],
+        "plateau_that_would_tell_s": 60.0,
+    }
+    rows = [[text.replace("\u202f", " ") for text in row] for row in hidden_table(entries).rows]
+    assert [row[:2] for row in rows[:3]] == [
+        ["creep over 20 s", "0.040 % of the motion"],
+        ["soft mode at 8.0 Hz", "0.10 % of the motion"],
+        ["backlash", "3.00 nm"],
+    ]
+    assert [row[3] for row in rows[:3]] == ["11.0 nm", "5.00 nm", "2.00 nm"]
+    assert rows[3][:2] == ["plateau that would tell the slowest", "60.0 s"]

@@ -85,6 +85,10 @@ def test_densities_are_read_in_nanometres_and_waves_per_millimetre():
 
 def test_the_areal_density_has_a_scale_that_is_not_cut():
     figure = form_figures.areal_density(CURVES["psd"]["areal"])
+    # 1e-24 m⁴ is 1 nm² mm².
+    drawn = figure.axes[0].collections[0]
+    assert drawn.get_array().max() == pytest.approx(2.0)
+    assert figure.axes[0].get_xlim() == pytest.approx((-1.5, 1.5))
     figure.canvas.draw()
     bar = figure.axes[1]
     width = figure.bbox.width
