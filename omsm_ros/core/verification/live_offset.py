@@ -64,6 +64,8 @@ class LiveOffset:
             return
         z, distance = (stream.column(first, end) for stream in (self._axes, self._distance))
         known = np.flatnonzero(np.isfinite(z))
+        if not len(known):
+            return
         z = np.interp(np.arange(len(z)), known, z[known])
         try:
             found = counter_offset(

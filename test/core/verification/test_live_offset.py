@@ -4,78 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from two_counters import blocks, motion, watched
 
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
-from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.core.verification.live_offset import LiveOffset
-from omsm_ros.nodes.correction_state import CorrectionState
-from omsm_ros.nodes.diagnostics import ERROR
 from omsm_ros.twin.cell import blocks_of
-from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN
 from omsm_ros.twin.scenario import Scenario, step_test_of
-
-N, BLOCK, PERIOD, NOISE = 8000, 50, 1e-3, 10e-9
-G = Plant().dynamics
-CALIBRATION = Calibration(
-    dynamics=G,
-    static_gain=PAPER_STATIC_GAIN,
-    sample_period=PERIOD,
-    valid_up_to=100.0,
-    covariance=np.diag(np.full(len(G.numerator) + len(G.denominator), 1e-24)),
-)
-LAG = G.low_frequency_delay / PERIOD
-Blocks = list[tuple[AxisBlock, DistanceBlock]]
-
-
-def motion(kind: str) -> FloatArray:
-    """Z of a chirp, of uneven steps, of a sine, or at rest [m], (n,)."""
-    t = np.arange(N + 2000) * PERIOD
-    if kind == "chirp":
-        return np.asarray(20e-6 * np.sin(2 * np.pi * (0.5 * t + 0.35 * t**2)))
-    if kind == "sine":
-        return np.asarray(20e-6 * np.sin(2 * np.pi * t / 0.12))
-    if kind == "rest":
-        return np.zeros(len(t))
-    edges = np.cumsum(np.random.default_rng(2).integers(150, 450, 60))
-    window = np.hanning(31) / np.hanning(31).sum()
-    return np.convolve(np.searchsorted(edges, t / PERIOD) % 4 * 10e-6, window, "same")
-
-
-def blocks(z: FloatArray, slip: int, *, late: float = 0.0, followed: float = 0.0) -> Blocks:
-    """Both streams: equal counts mean triggers ``slip`` apart, axes are stamped ``late`` [s].
-
-    followed: share of the motion of Z that the surface makes, too, 25 samples later
-    """
-    random, made = np.random.default_rng(4), []
-    still = np.zeros(BLOCK)
-    for first in range(500, N, BLOCK):
-        k = first + np.arange(BLOCK)
-        at = np.arange(len(z))
-        seen = np.interp(k + slip - LAG, at, z) - followed * np.interp(k + slip - 25, at, z)
-        distance = 50e-6 - PAPER_STATIC_GAIN * seen + random.normal(0.0, NOISE, BLOCK)
-        when, stamp = first * PERIOD, {"first_sample": first, "sample_period": PERIOD}
-        axes = AxisBlock(
-            stamp_ns=round((when + late) * 1e9), x=still, y=still, z=z[k], b=still, c=still, **stamp
-        )
-        jitter = float(random.normal(0.0, 5e-6))
-        made.append(
-            (axes, DistanceBlock(stamp_ns=round((when + jitter) * 1e9), distance=distance, **stamp))
-        )
-    return made
-
-
-def watched(came: Blocks, in_use: int = 0) -> LiveOffset:
-    watch = LiveOffset(CALIBRATION, in_use)
-    for i, (axes, distance) in enumerate(came):
-        watch.add(axes)
-        watch.add(distance)
-        if i % 20 == 0:
-            watch.judge()
-    return watch
 
 
 @pytest.mark.parametrize("kind", ["chirp", "steps"])
@@ -129,35 +63,15 @@ def test_it_is_told_within_two_seconds_of_motion() -> None:
     assert watched(blocks(motion("steps"), 1)[:42]).established is not None
 
 
-def reported(slip: int, late: float, tolerance: float = TWO_DRIVERS_S) -> tuple[str, str]:
-    """Return what the corrector says of a motion, and the offset it established."""
-    trigger = CommonTrigger(stamp_tolerance=tolerance)
-    came = blocks(motion("steps"), slip, late=late)
-    corrector = Corrector(CALIBRATION, CorrectionOptions(trigger=trigger))
-    for axes, distance in came:
-        corrector.push_axes(axes)
-        corrector.push_distance(distance)
-    assert not corrector.slips.one_driver
-    watch = watched(came, trigger.counter_offset)
-    report = CorrectionState().report(corrector, 0.0, 0.0, watch)
-    said = report.text if report.level == ERROR else ""
-    return said, str(report.values["motion_offset_samples"])
-
-
-def test_a_slip_that_a_late_link_hides_from_the_stamps_is_told_by_the_motion() -> None:
-    """Axes three samples ahead, and 3 ms late: their stamps agree, their samples do not."""
-    said, offset = reported(3, late=0.0)
-    assert offset == "3"
-    assert "state counter_offset 3" in said
-
-
-def test_a_link_that_is_late_is_told_from_a_slip() -> None:
-    said, offset = reported(0, late=3e-3)
-    assert offset == "0"
-    assert "slipped by 3 samples" in said
-    assert "equal counts are one trigger: a link is late" in said
-
-
-def test_nothing_is_said_where_stamps_and_motion_agree() -> None:
-    assert reported(0, late=0.0) == ("", "0")
-    assert reported(0, late=3e-3, tolerance=3e-3) == ("", "0")
+def test_nothing_is_told_of_counts_that_only_one_stream_has() -> None:
+    """The probe starts late, in a gap of the axes, which have gone on since."""
+    came = blocks(motion("chirp"), 0)
+    counted = [axes.first_sample for axes, _ in came]
+    watch = watched([])
+    for axes, _ in came[: counted.index(4500)]:
+        watch.add(axes)
+    for _, distance in came[counted.index(5000) : counted.index(7500)]:
+        watch.add(distance)
+    watch.add(came[-1][0])
+    watch.judge()
+    assert watch.established is None
