@@ -13,6 +13,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
+from omsm_ros.core.dynamics.response_band import spread_along
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 
@@ -161,5 +162,5 @@ def _residue(
 
 
 def _spread(direction: FloatArray, covariance: FloatArray) -> float:
-    variance = float(direction @ covariance @ direction)
-    return float(np.sqrt(max(variance, 0.0))) if np.isfinite(variance) else np.inf
+    spread = float(spread_along(direction, covariance))
+    return spread if np.isfinite(spread) else np.inf

@@ -47,13 +47,24 @@ def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray
     return np.stack([both.real, both.imag])
 
 
+def spread_along(directions: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard deviation along ``directions`` (…, p) of what has ``covariance`` (p, p).
+
+    Shape (…,). What two parameters do alike, such as a delay and a pole far above the band, no data
+    tell apart: they are known to seconds each, and together to microseconds. Where such terms
+    cancel to less than their own rounding, that is what is returned, and not zero.
+    """
+    variance = np.einsum("...p,pq,...q->...", directions, covariance, directions)
+    size = np.abs(directions)
+    rounding = np.finfo(float).eps * np.sum((size @ np.abs(covariance)) * size, axis=-1)
+    return np.asarray(np.sqrt(np.maximum(variance, rounding)))
+
+
 def response_band(
     dynamics: TransferFunction, covariance: FloatArray, frequency: FloatArray
 ) -> Band:
     """Return the standard uncertainty of gain and phase from the ``covariance`` (p, p) of G."""
-    jacobian = relative_response_jacobian(dynamics, frequency)
-    variance = np.einsum("akp,pq,akq->ak", jacobian, covariance, jacobian)
-    gain, phase = np.sqrt(np.maximum(variance, 0.0))
+    gain, phase = spread_along(relative_response_jacobian(dynamics, frequency), covariance)
     return Band(np.asarray(frequency, np.float64), gain, phase)
 
 
@@ -70,7 +81,7 @@ def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: Floa
         gradient[1] = -1 / dynamics.numerator[0]
     if poles:
         gradient[zeros + 1] = 1.0
-    return float(np.sqrt(max(float(gradient @ covariance @ gradient), 0.0)))
+    return float(spread_along(gradient, covariance))
 
 
 def widening(band: Band, other: Band, apart: ComplexArray) -> float:

@@ -264,3 +264,34 @@ def test_uncertainty_of_the_low_frequency_delay_with_a_gain_at_rest():
     covariance = mixing @ mixing.T
     expected = np.sqrt(np.array(gradient) @ covariance @ np.array(gradient))
     assert low_frequency_delay_uncertainty(g, covariance) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_pole_and_a_delay_that_do_the_same_leave_no_frequency_without_uncertainty():
+    """Each known to minutes, both together to 1 µs: at least what that alone would leave."""
+    mode = 2 * np.pi * 8.0
+    light = np.array([1.0, 0.01 / mode, mode**-2])
+    numerator = [1.0, 0.0099 / mode, 0.9999 * mode**-2]
+    dynamics = TransferFunction(numerator, np.convolve(light, [1.0, 1e-10]), 5e-5)
+    # The pole more, the delay less.
+    alike = 300.0 * np.array([0.0, 0.0, 0.0, *light, -1.0])
+    apart = np.array([0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0])
+    frequency = np.geomspace(0.1, 50.0, 500)
+    band, least = (
+        response_band(dynamics, covariance, frequency)
+        for covariance in (
+            np.outer(alike, alike) + np.outer(apart, apart),
+            np.outer(apart, apart),
+        )
+    )
+    assert np.all(band.gain >= 0.9 * least.gain)
+    assert np.all(band.phase >= 0.9 * least.phase)
+    both = np.outer(alike, alike) + np.outer(apart, apart)
+    assert low_frequency_delay_uncertainty(dynamics, both) >= 0.9e-6
+
+
+def test_what_is_known_exactly_has_no_uncertainty():
+    nothing = np.zeros((7, 7))
+    band = response_band(G, nothing, np.array([1.0, 10.0]))
+    assert not np.any(band.gain)
+    assert not np.any(band.phase)
+    assert low_frequency_delay_uncertainty(G, nothing) == 0.0
