@@ -15,6 +15,8 @@ _BRIDGE_S = 0.3
 _MIN_BRIDGE_SAMPLES = 64
 # In it a light mode rings down.
 _REST_S = 1.0
+# A record of milliseconds tells of no mode that rings for a second: so many times as long it rests.
+_RESTS_OF_RECORD = 4.0
 # Power is then known to 10 %.
 _SMOOTHING_BINS = 101
 
@@ -24,8 +26,10 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
 
     On the way back it rests, until nothing rings when the record starts anew.
     """
-    bridge = max(round(_BRIDGE_S / period), _MIN_BRIDGE_SAMPLES)
-    total = fft.next_fast_len(len(motion) + bridge + round(_REST_S / period), real=True)
+    duration = len(motion) * period
+    bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
+    rest = round(min(_REST_S, _RESTS_OF_RECORD * duration) / period)
+    total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
     phase = np.arange(1, total - len(motion) + 1) / bridge
     way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
     return np.concatenate([motion, way_back])

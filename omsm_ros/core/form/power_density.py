@@ -108,7 +108,7 @@ def _areal(cells: Cells, image: FloatArray, window: FloatArray) -> tuple[FloatAr
 
 def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     """Return the spacings of the frequencies along x and y [1/m]."""
-    across, along = (float(v[1] - v[0]) if len(v) > 1 else 1.0 for v in (x, y))
+    across, along = (float(abs(v[1] - v[0])) if len(v) > 1 else 1.0 for v in (x, y))
     return across, along
 
 

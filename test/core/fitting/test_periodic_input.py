@@ -21,6 +21,14 @@ def test_before_it_starts_anew_the_period_rests():
     np.testing.assert_array_equal(closed[-1000:], motion[0])
 
 
+def test_a_record_of_milliseconds_is_not_followed_by_a_second_of_rest():
+    """At a megahertz that would be a million samples for three hundred."""
+    motion = np.linspace(0.0, 1.0, 300)
+    closed = close_period(motion, 1e-6)
+    assert len(closed) < 7 * len(motion)
+    np.testing.assert_array_equal(closed[-len(motion) :], motion[0])
+
+
 def test_noise_is_taken_out_of_the_motion_and_motion_is_not():
     rng = np.random.default_rng(5)
     time, centres = np.arange(4000) * 1e-3, np.arange(0.5, 3.5, 0.45)

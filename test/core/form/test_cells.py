@@ -1,5 +1,7 @@
 """Cells, filters, texture and spectra of waves whose figures are known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -159,3 +161,17 @@ def test_a_wave_does_not_leak_into_other_frequencies():
     along = found.areal[0]
     away = np.abs(np.abs(found.x) - 250.0)
     assert np.max(along[away > 2.1 * found.x[1]]) < 1e-3 * np.max(along)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 40])
+def test_what_is_in_the_band_of_a_narrow_strip_is_no_less_than_nothing(rows):
+    """A transform of two cells has zero and a negative frequency alone."""
+    mean = np.random.default_rng(3).normal(0.0, 1e-9, (rows, 40))
+    present = np.ones(mean.shape, bool)
+    cells = replace(Cells.of(square(wave(4e-3))), mean=mean, present=present, noise=0.0 * mean)
+    for strip in (cells, replace(cells, mean=mean.T, present=present.T, noise=0.0 * mean.T)):
+        found = power_density(strip)
+        assert found.mean_square_in_band >= 0
+        assert found.mean_square > 0
+        assert np.all(np.diff(found.radial.position) > 0)
+        assert np.all(found.radial.value >= 0)
