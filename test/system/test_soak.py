@@ -32,8 +32,6 @@ DEVICE_PORT = 17_000 + os.getpid() % 1000
 NODES = ("confocal_driver", "corrector", "calibrator", "recorder")
 MOST_GROWTH = 0.01
 LONGEST_FAULT_S = 3.0
-# Longer than any fault: who sends keeps what a listener missed, in memory that stays its own.
-FILLING_S = 10.0
 LONGEST_DELAY_S = 20.0  # of a listener that was stopped, and is sent again what it missed
 READING_PERIOD_S = 5.0
 
@@ -129,9 +127,9 @@ class Hour:
     def noise_on_the_wire(self):
         self.wire.disturb(bytes(range(256)) * 2)
 
-    def stopped(self, node, seconds=2.0):
+    def stopped(self, node):
         os.kill(self.cell.processes.pid(node), signal.SIGSTOP)
-        self.pass_by(seconds)
+        self.pass_by(2.0)
         os.kill(self.cell.processes.pid(node), signal.SIGCONT)
 
     def deactivated(self, node):
@@ -178,12 +176,9 @@ def test_an_hour_with_a_fault_every_minute(cell, true_calibration, step_test):
         lasting, killed = hour.faults()
         both = itertools.chain.from_iterable(zip(itertools.cycle(killed), itertools.cycle(lasting)))
         # Memory is that of one life, in which queues have filled and each fault was met once: nodes
-        # are killed for a third of the time, then they live on. A queue that fills is no leak, but
-        # how far 2 s fill it is chance.
-        round_of_all = len(lasting) * (FAULT_PERIOD_S + LONGEST_FAULT_S) + len(NODES) * FILLING_S
-        strike(hour, both, SAMPLES // 2 - round(1000 * round_of_all))
-        for node in NODES:
-            hour.stopped(node, FILLING_S)
+        # are killed for a third of the time, then they live on.
+        round_of_all = round(len(lasting) * (FAULT_PERIOD_S + LONGEST_FAULT_S) * 1000)
+        strike(hour, both, SAMPLES // 2 - round_of_all)
         strike(hour, itertools.cycle(lasting), SAMPLES - round(FAULT_PERIOD_S * 1000))
         cell.operator.wait_until("the end", lambda: hour.played >= SAMPLES, lambda: hour.played)
         growth = {node: growth_of(hour.readings, node) for node in NODES}
