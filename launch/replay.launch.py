@@ -56,9 +56,8 @@ def generate_launch_description() -> LaunchDescription:
                 "bag": _text("bag"),
                 "cell": _text("cell"),
                 "wait_for": "corrector",
-                "rate": ParameterValue(
-                    LaunchConfiguration("rate")
-                ),  # the player says what is wrong
+                # Of whatever type it is: the player says what is wrong with it.
+                "rate": ParameterValue(LaunchConfiguration("rate")),
             }
         ],
         output="screen",

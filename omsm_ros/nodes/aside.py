@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import queue
 import threading
@@ -15,6 +14,7 @@ from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes.diagnostics import survive
+from omsm_ros.nodes.memory import give_back
 from omsm_ros.nodes.running import Paced, refuse
 from omsm_ros.nodes.topics import REQUESTS_QOS
 
@@ -81,7 +81,8 @@ class Aside:
             try:
                 task = self._work.get(timeout=patience)
             except queue.Empty:
-                _give_memory_back()
+                gc.collect()  # of what failed, the traceback holds all
+                give_back()  # or a node has for good the memory of its largest request
                 patience = None
                 continue
             if task is None:
@@ -98,14 +99,3 @@ class Aside:
         # The executor looks at who waits only when something else wakes it.
         if (executor := self._node.executor) is not None:
             executor.wake()
-
-
-def _give_memory_back() -> None:
-    """Return to the system what work of hundreds of megabytes has left free.
-
-    The C library keeps it, or else a node has for good the memory of its largest request.
-    """
-    gc.collect()  # of what failed, the traceback holds all
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
-    if trim is not None:
-        trim(0)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import optimize, signal
 
-from omsm_ros.core.dynamics.response_band import relative_response_jacobian
+from omsm_ros.core.dynamics.response_band import relative_response_jacobian, spread_along
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError, IdentificationError
@@ -125,11 +125,10 @@ def fit_two_mass(
 
     best = _least(residual, _starts(oscillating, table_mass))
     spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
-    variance = np.einsum("ip,pq,iq->i", spread, covariance, spread)
     freedom = max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1)
     return TwoMassFit(
         model(best.x),
-        np.sqrt(np.maximum(variance, 0.0)),
+        spread_along(spread, covariance),
         float(np.sqrt(2 * best.cost / freedom)),
     )
 

@@ -268,7 +268,8 @@ def _bases(model: Model) -> list[Fit]:
 
 def _best_plain(model: Model) -> Fit | None:
     """Return the best fit of a structure and its roll-off alone, if one was tried."""
-    return min(_plain(model), key=lambda c: c.bic).fit if _plain(model) else None
+    plain = _plain(model)
+    return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
 
 
 def _plain(model: Model) -> list[Candidate]:

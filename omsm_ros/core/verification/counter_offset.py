@@ -90,6 +90,7 @@ def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -
     size = 1 << (len(z) + most).bit_length()
     wanted = np.arange(-most, most + 1)
 
+    # As scipy.signal.correlate does, for which a live node would have to load all of scipy.signal.
     def lagged(a: FloatArray, b: FloatArray) -> FloatArray:
         product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
         return np.asarray(np.fft.irfft(product, size)[wanted])
