@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 
+from omsm_ros.core.form.passes import passes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import Term, zernike_values
 from omsm_ros.errors import DataError
 
@@ -22,8 +24,10 @@ from omsm_ros.errors import DataError
 CHUNK = 8192
 # Ten digits are left, more than any of them is worth.
 _WORST_CONDITION = 1e6
-# Consecutive points whose errors may hang together: half a turn of the paper's scan has a thousand.
+# Consecutive points whose errors may hang together, where they follow no path with passes.
 _GROUP, _LEAST_GROUPS = 128, 4
+# Of sums over passes: a wave of sixteen passes leaves a four-hundredth, noise all of itself.
+_DIFFERENCES = 4
 # Terms of the series 1 / (1 − h) in the share h that a group has of the fit, some tenth.
 _FOLLOWED = 2
 
@@ -32,7 +36,8 @@ _FOLLOWED = 2
 class ZernikeFit:
     """Coefficients (k,) [m] of ``terms``, each one at the rim of ``disc``.
 
-    covariance: from the scatter of the points about the fit (k, k) [m²]
+    covariance: from the scatter of the points about the fit, and form that they do not resolve
+        (k, k) [m²]
     left_out: terms that the points do not separate
     effects: coefficients of the further deviations (k, e) [m]
     """
@@ -75,8 +80,9 @@ def fit_zernikes(
     weights: the area of each point (n,); None: every point alike
     effects: further deviations (e, n) [m] whose coefficients (k, e) are wanted of the same fit
 
-    The covariance holds errors that hang together over 128 successive points. Raises DataError for
-    fewer points than terms, or points that determine no term.
+    The covariance holds errors that hang together over a pass of the path, and form between passes
+    that they do not resolve. Raises DataError for fewer points than terms, or points that determine
+    no term.
     """
     if len(x) < max(2 * len(terms), 8):
         raise DataError(
@@ -150,54 +156,80 @@ def _scores(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (k, k) of columns times residual, by groups and by single points.
 
-    Groups are of successive points, whose errors may hang together.
+    Groups are passes of the path. Form that the terms do not describe is no error where the path
+    is close enough for it: then sums over passes follow a smooth course, and only what departs
+    from it counts, by fourth differences (of systematic samples: K. Wolter, Introduction to
+    Variance Estimation, 2007, ch. 8). Form between passes that none resolves departs, a whole
+    pass long. Without passes, groups are of successive points, whose errors may hang together.
 
     inverse: of the Gram matrix (k, k). The fit follows each group's errors by the group's share of
     that matrix, so that its residuals are too small; they are taken as the fit to all other groups
     leaves them (delete-a-group jackknife; R. Bell, D. McCaffrey, Surv. Methodol. 28, 169).
     """
-    size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * len(terms) else 1
-    together, single = np.zeros((2, len(terms), len(terms)))
-    for begin in range(0, len(x), CHUNK):
-        chunk = slice(begin, begin + CHUNK)
+    begins, differences = _groups(x, y, len(terms))
+    ends = np.append(begins[1:], len(x))
+    sums, single = np.empty((len(terms), len(begins))), np.zeros((len(terms), len(terms)))
+    first = 0
+    while first < len(begins):
+        # Whole groups, as many as stay in the cache.
+        last = max(int(np.searchsorted(ends, begins[first] + CHUNK, "right")), first + 1)
+        chunk, groups = slice(begins[first], ends[last - 1]), slice(first, last)
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
         residual = deviation[chunk] - coefficients @ columns
         weighted = columns if weights is None else columns * weights[chunk]
         products = weighted * residual
-        single += products @ products.T
-        sums = _sums(products, columns, weighted, inverse, size)
-        together += sums @ sums.T
-    groups = max(-(-len(x) // size), 2)
+        alone = weighted * _from_point_to_point(residual) if differences else products
+        single += alone @ alone.T
+        sizes = ends[groups] - begins[groups]
+        sums[:, groups] = _sums(products, columns, weighted, inverse, sizes)
+        first = last
+    scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
+    count = max(scatter.shape[1], 2)
+    # The sum over all groups is zero: where they are taken as they are, one of them is not free.
+    free = count if differences else count - 1
     freedom = max(1 - len(terms) / len(x), 1e-3)
-    return together * groups / (groups - 1) / freedom, single / freedom
+    return scatter @ scatter.T * len(begins) / free / freedom, single / freedom
+
+
+def _from_point_to_point(residual: FloatArray) -> FloatArray:
+    """Return what neighbours of a path do not share of the ``residual`` (n,), as large as noise."""
+    if len(residual) < 3:
+        return residual
+    rough = np.diff(residual, 2) / np.sqrt(6)
+    return np.asarray(np.concatenate([rough[:1], rough, rough[-1:]]), np.float64)
+
+
+def _groups(x: FloatArray, y: FloatArray, terms: int) -> tuple[IntArray, int]:
+    """Return where groups of points begin (g,), and how often sums over them are to be differenced.
+
+    terms: how many are fitted
+    """
+    begins = passes(x, y)
+    if begins is not None:
+        return begins, _DIFFERENCES
+    size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * terms else 1
+    return np.arange(0, len(x), size), 0
 
 
 def _sums(
-    products: FloatArray, columns: FloatArray, weighted: FloatArray, inverse: FloatArray, size: int
+    products: FloatArray,
+    columns: FloatArray,
+    weighted: FloatArray,
+    inverse: FloatArray,
+    sizes: IntArray,
 ) -> FloatArray:
     """Return sums of ``products`` (k, n) over groups (k, g), as the fit to all others leaves them.
 
-    size: points of a group
+    sizes: points of each group (g,)
     """
-    if size == 1:
-        share = np.sum(weighted * (inverse @ columns), axis=0)
-        return np.asarray(products * sum(share**n for n in range(_FOLLOWED + 1)))
-    # A matrix (k, size) a group: its products stay in the cache that the columns are in.
-    blocks, weighted_blocks = _by_groups(columns, size), _by_groups(weighted, size)
-    followed = _by_groups(products, size).sum(axis=2, keepdims=True)
+    begins = np.cumsum(sizes) - sizes
+    followed = np.add.reduceat(products, begins, axis=1)
     sums = followed
     for _ in range(_FOLLOWED):
-        along = (inverse @ followed).transpose(0, 2, 1) @ blocks
-        followed = weighted_blocks @ along.transpose(0, 2, 1)
+        along = np.sum(np.repeat(inverse @ followed, sizes, axis=1) * columns, axis=0)
+        followed = np.add.reduceat(weighted * along, begins, axis=1)
         sums = sums + followed
-    return np.asarray(sums[..., 0].T)
-
-
-def _by_groups(columns: FloatArray, size: int) -> FloatArray:
-    """Return ``columns`` (k, n) as groups (g, k, size) of points in turn, the last with zeros."""
-    short = -columns.shape[1] % size
-    whole = np.pad(columns, ((0, 0), (0, short))) if short else columns
-    return whole.reshape(len(columns), -1, size).transpose(1, 0, 2)
+    return np.asarray(sums, np.float64)
 
 
 def _no_less(covariance: FloatArray, floor: FloatArray) -> FloatArray:
