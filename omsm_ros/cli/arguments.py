@@ -14,6 +14,8 @@ from omsm_ros.storage import strict_json
 from omsm_ros.storage.maps.length_units import LengthUnits, units_of
 from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
+_LONGEST_MESSAGE = 300
+
 
 class UsageError(ConfigurationError):
     """The command line cannot be understood."""
@@ -30,6 +32,8 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError instead of printing and exiting."""
         words = " ".join(filter(None, (self.prog, self.word)))
+        if len(message) > _LONGEST_MESSAGE:  # argparse repeats what it was given
+            message = f"{message[:_LONGEST_MESSAGE]}…"
         raise UsageError(f"{message}; see '{words} --help'")
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import SIGNAL, shown
-from omsm_ros.storage.files import read_text, said
+from omsm_ros.storage.files import read_text
 
 # Two hours of two columns at 1 kHz, in three hundred megabytes of memory.
 MAX_TABLE_BYTES = 200_000_000
@@ -21,6 +20,10 @@ MAX_TABLE_BYTES = 200_000_000
 _MARK = "\ufeff"
 # Among which the line of names is looked for, where the first is none.
 _HEAD_LINES = 100
+_ROWS = (
+    "below the names stand numbers with decimal points, between commas, as many as there are "
+    "names; delete other lines"
+)
 
 
 def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
@@ -29,6 +32,8 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
     Raises FileError for a file without such columns, or with anything but plausible numbers.
     """
     text = read_text(path, MAX_TABLE_BYTES, FileError, "table").removeprefix(_MARK)
+    if "\r" in text:  # Windows' line ends, or old Macs'
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
     what = f"table {str(path)!r}"
     head, _, body = text.partition("\n")
     known = _cells(head, ",")
@@ -39,10 +44,9 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
                 f"{shown(head.strip())}; {_where(text, names)}"
             )
     places = [known.index(name) for name in names]
-    try:
-        table = numbers_in(body, what, places)
-    except FileError as err:
-        raise _culprit(body, what, places) or err from None
+    table = rows_in(
+        _lines_of(body), what, _ROWS, above=1, cells=len(known), delimiter=",", usecols=places
+    )
     if len(table) < 2:
         raise FileError(f"{what} has {len(table)!r} lines of numbers; record more")
     for i, name in enumerate(names):
@@ -74,40 +78,68 @@ def _where(text: str, names: tuple[str, ...]) -> str:
     return "name columns as that line does, each once"
 
 
-def _culprit(body: str, what: str, places: Sequence[int]) -> FileError | None:
-    """Return the first line below the names that is no row, None if each is one."""
-    for number, line in enumerate(body.split("\n"), 2):
-        cells = line.split("#")[0].split(",")
-        try:
-            if line.strip():
-                [float(cells[place]) for place in places]
-        except (ValueError, IndexError):
-            return FileError(
-                f"{what}, line {number}: {shown(line.strip())} is no row of numbers; below the "
-                "names stand numbers with decimal points, between commas; delete other lines"
-            )
-    return None
+def _lines_of(text: str) -> Iterator[str]:
+    """Yield the lines of a text one by one: all at once take four times its memory."""
+    start = 0
+    while (end := text.find("\n", start)) >= 0:
+        yield text[start:end]
+        start = end + 1
+    yield text[start:]
 
 
-def numbers_in(body: str, what: str, places: Sequence[int] | None = None) -> FloatArray:
-    """Return numbers of a CSV text without its line of names, (lines, columns ``places`` or all).
-
-    Raises FileError, which calls the text ``what``, for anything but numbers.
-    """
-    remedy = "write a line of names, then numbers"
-    return rows_in(io.StringIO(body), what, remedy, delimiter=",", usecols=places)
-
-
-def rows_in(source: Any, what: str, remedy: str, **layout: Any) -> FloatArray:
+def rows_in(
+    lines: Iterable[str],
+    what: str,
+    remedy: str,
+    *,
+    above: int = 0,
+    cells: int | None = None,
+    **layout: Any,
+) -> FloatArray:
     """Return the numbers of lines of text, (lines, columns); (0, …) of none.
 
-    source, layout: as numpy.loadtxt takes them
+    above: how many lines of the file stand above these, cells: in each line, None if unknown
+    layout: delimiter, comments, usecols, max_rows as numpy.loadtxt takes them
 
-    Raises FileError, which calls the text ``what`` and names the ``remedy``, for other lines.
+    Raises FileError, which calls the text ``what`` and names the ``remedy``, for the first line
+    that is something else.
     """
+    seen = [above, ""]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that it is empty; the caller says so
-            return np.loadtxt(source, ndmin=2, **layout)
+            return np.loadtxt(_rows(lines, seen, cells, layout), ndmin=2, **layout)
     except (ValueError, OSError) as err:
-        raise FileError(f"{what} is no table: {said(err)}; {remedy}") from err
+        # numpy takes one line at a time: what it could not read is in the last one.
+        line = shown(str(seen[1]).strip())
+        raise FileError(f"{what}, line {seen[0]}: {line} is no row of numbers; {remedy}") from err
+
+
+def _rows(
+    lines: Iterable[str], seen: list[Any], cells: int | None, layout: Mapping[str, Any]
+) -> Iterator[str]:
+    """Yield lines that are not blank, and note in ``seen`` the number and text of the last.
+
+    Raises ValueError for a line with another count of ``cells``: numpy passes over a cell too
+    many, and the comma of 1,5 makes one.
+    """
+    mark = layout.get("delimiter")
+    marks = -1 if cells is None or mark is None else cells - 1
+    for number, line in enumerate(lines, seen[0] + 1):
+        seen[0], seen[1] = number, line
+        if line.count(mark or ",") == marks > 0:  # as nearly all are
+            yield line
+        elif line and not line.isspace():
+            if cells is not None:
+                _check_cells(line, mark, cells, layout.get("comments", "#"))
+            yield line
+
+
+def _check_cells(line: str, mark: str | None, cells: int, comments: str | Iterable[str]) -> None:
+    for sign in comments:
+        line = line.split(sign)[0]
+    found = line.split(mark)
+    while len(found) > cells and not found[-1].strip():
+        found.pop()
+    if line.strip() and len(found) != cells:
+        raise ValueError(f"it has {len(found)} cells, not {cells}")

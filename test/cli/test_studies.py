@@ -74,10 +74,13 @@ def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("time_s,z_m\n0,1e-6\n", "two columns"),
-        ("time_s,z_m\n0,a\n1,b\n", "no table"),
-        ("time_s,z_m\n0,1\n1,nan\n", r"z_m\[1\] is nan m"),
+        ("time_s,z_m\n0,1e-6\n", "1 lines of numbers"),
+        ("time_s,z_m\n0,a\n1,b\n", "line 2: '0,a' is no row"),
+        ("time_s,z_m\n0,1\n1,nan\n", "z_m has no reading in 1 of 2 rows"),
         ("time_s,z_m\n0,1\n1,1\n5,1\n", "even steps"),
+        ("time_s,z_um\n0,1\n1,1\n", "0 columns 'z_m'"),  # another unit than was asked for
+        ("0,1\n1,1\n2,1\n", "0 columns 'time_s'"),  # its first sample was lost
+        ("time_s,z_m\n0,0,1,5\n0,1,1,5\n", "line 2: '0,0,1,5' is no row"),  # decimal commas
         ("time_s,z_m\n2,1\n1,1\n", "step of time_s is -1.0 s"),
     ],
 )

@@ -33,6 +33,8 @@ def test_columns_are_found_by_name_in_the_order_asked_for(tmp_path):
         ("u,y\n1,2\n3,nan\n", "y has no reading in 1 of 2 rows"),
         ("u,y\n1,2\n3,1e300\n", "expected a number"),
         ("", "0 columns 'u'"),
+        ("u,y\n1,5,2,5\n3,5,4,5\n", "line 2: '1,5,2,5' is no row"),  # decimal commas
+        ("u,y,t\n1,2,3\n3,4\n", "line 3: '3,4' is no row"),  # cut short
     ],
 )
 def test_what_is_no_such_table_is_one_clear_error(tmp_path, text, says):
@@ -46,7 +48,15 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["\ufeffu,y\n1,2\n3,4\n", "u,y\r\n1,2\r\n3,4\r\n", '"u","y"\n1,2\n\n3,4\n']
+    "text",
+    [
+        "\ufeffu,y\n1,2\n3,4\n",
+        "u,y\r\n1,2\r\n3,4\r\n",
+        "u,y\r1,2\r3,4\r",
+        '"u","y"\n1,2\n\n3,4\n',
+        "u,y,\n1,2,\n3,4,\n  \n",
+        "u,y\n1,2,\n# at noon, 20 degrees, dry\n3,4\n",
+    ],
 )
 def test_what_windows_and_spreadsheets_add_is_read_past(tmp_path, text):
     u, y = load_columns(written(tmp_path, text), ("u", "y"))

@@ -211,7 +211,11 @@ def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> Float
     Places share points with their neighbours: so much smoothed, white noise of the size of means
     has the size of single heights. A Gaussian of width σ leaves 1 / 4πσ² of the variance.
     """
-    ratio = float(np.median(side.single / side.averaged)) ** 2
+    # Heights of few digits may not scatter at all: nothing is smoothed then.
+    ratios = np.divide(
+        side.single, side.averaged, out=np.ones(len(side.single)), where=side.averaged > 0
+    )
+    ratio = float(np.median(ratios)) ** 2
     width = np.sqrt(1 / (4 * np.pi * min(ratio, 1.0)))
     shape = matched.grid.height.shape
     made = np.empty((_DRAWS, len(side.single)))

@@ -29,7 +29,10 @@ def checked_motion(z: FloatArray) -> FloatArray:
     """Return ``z`` (n,) as float64; raises DataError if it is too short or not finite."""
     motion = np.asarray(z, np.float64)
     if motion.ndim != 1 or len(motion) < MIN_SAMPLES:
-        raise DataError(f"motion of shape {motion.shape!r}, expected {MIN_SAMPLES} samples or more")
+        raise DataError(
+            f"motion of shape {motion.shape!r}, expected {MIN_SAMPLES} samples or more; "
+            "give a longer one"
+        )
     if not np.all(np.isfinite(motion)):
         lost = int(np.count_nonzero(~np.isfinite(motion)))
         raise DataError(f"motion holds {lost!r} values that are not finite; leave them out")

@@ -10,6 +10,7 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.form_model import LEAST_LIMIT_M
 from omsm_ros.core.registration.freedoms import widest
 from omsm_ros.core.registration.placement import (
+    LEAST_POINTS,
     Aperture,
     Placement,
     Portion,
@@ -21,8 +22,6 @@ from omsm_ros.core.samples import scatter
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 
-# Four for each column of the fit beside form are the least.
-LEAST_POINTS = 200
 # With the refinement that follows it took 12 to 36 on spheres and off-axis paraboloids with form.
 _MOST_TURNS = 30
 # A pose stands when its last step moved no point by more than this share of their spread.

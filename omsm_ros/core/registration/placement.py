@@ -20,6 +20,8 @@ from omsm_ros.core.surface.posed import Pose
 from omsm_ros.core.surface.slopes import gradient_of, unit_normal
 from omsm_ros.errors import DataError, SurfaceError
 
+# Four for each column of the fit beside form are the least.
+LEAST_POINTS = 200
 FREEDOMS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
 
@@ -165,10 +167,18 @@ def selection(portions: Portions, most: int) -> Portion:
 
 
 def usable(points: Placed, aperture: Aperture | None) -> Placed:
-    """Return the points with a deviation that lie within the aperture."""
+    """Return the points with a deviation that lie within the aperture.
+
+    Raises DataError for too few of them.
+    """
     good = np.isfinite(points.deviation)
     if aperture is not None:
         good &= aperture.holds(points.x, points.y)
+    if (count := int(np.sum(good))) < LEAST_POINTS:
+        raise DataError(
+            f"{count} points lie on the nominal surface, expected {LEAST_POINTS} or more; "
+            "check its parameters, the aperture and the units of the cloud"
+        )
     return points.part(good)
 
 

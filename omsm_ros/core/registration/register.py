@@ -16,7 +16,6 @@ import numpy as np
 
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.coarse_placement import (
-    LEAST_POINTS,
     SHARE_OF_SPREAD,
     coarse_placement,
 )
@@ -87,12 +86,6 @@ def register(
     """
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
-    first = usable(placed(surface, start, chosen), aperture)
-    if len(first.x) < LEAST_POINTS:
-        raise DataError(
-            f"{len(first.x)} points lie on the nominal surface, expected {LEAST_POINTS} or more; "
-            "check its parameters, the aperture and the units of the cloud"
-        )
     freedoms = _determined(surface, chosen, asked, aperture, start)
     try:
         at = coarse_placement(surface, chosen, freedoms.fitted, aperture, start)

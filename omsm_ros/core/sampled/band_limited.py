@@ -87,7 +87,7 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
     if int(np.sum(used)) < 2 * LEAST_SAMPLES or not np.all(np.isfinite(input)):
         raise IdentificationError(
             f"{int(np.sum(used))!r} samples are used, at least {2 * LEAST_SAMPLES} are needed, "
-            "and a finite input everywhere"
+            "and a finite input everywhere; record more"
         )
     samples = len(input)
     moving = np.ones(samples, np.bool_)

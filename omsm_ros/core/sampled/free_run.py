@@ -16,6 +16,8 @@ from omsm_ros.least_squares import least_squares
 
 # The least that shows more than an initial state of 20 poles and an offset.
 _LEAST_SAMPLES = 50
+# The square of a smaller change, over a noise that is smaller still, is no float.
+_LEAST_CHANGE = 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ def free_run(
     Nothing of the model is fitted again; only the state that it starts in, and a constant, are
     taken from the output. Samples are a ``sample_period`` of the model apart.
 
-    Raises IdentificationError for a record that is too short.
+    Raises IdentificationError for a record that is too short, or that does not change.
     """
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
     if np.sum(counted) < _LEAST_SAMPLES or len(input) != len(output):
@@ -48,14 +50,27 @@ def free_run(
             f"input of {len(input)!r} samples, output of {int(np.sum(counted))!r} that count; "
             f"at least {_LEAST_SAMPLES} of both are needed; record longer"
         )
+    check_changes(input, "input")
+    check_changes(output[counted], "output")
     driven, free = _responses(model, input - model.working_point[0])
     columns = np.column_stack([*free, np.ones(len(input))])
     unknown = least_squares(columns[counted], (output - driven)[counted])
     run = driven + columns @ unknown
     residual = np.where(counted, output - run, np.nan)
     rms = float(np.sqrt(np.mean(residual[counted] ** 2)))
-    variance = float(np.var(output[counted])) or 1.0
+    variance = float(np.var(output[counted]))
     return FreeRun(np.asarray(run), residual, 1 - rms**2 / variance, rms)
+
+
+def check_changes(values: FloatArray, name: str) -> None:
+    """Raise IdentificationError for a column that does not change; what is finite of it counts."""
+    values = values[np.isfinite(values)]
+    change = float(np.ptp(values)) if len(values) else 0.0
+    if change <= _LEAST_CHANGE:
+        raise IdentificationError(
+            f"the {name} changes by {change:g} in all, which tells nothing; excite it while "
+            "recording, or give it in a larger unit"
+        )
 
 
 def resting_output(

@@ -25,7 +25,7 @@ from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoic
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.sampled.band_limited import band_limited
-from omsm_ros.core.sampled.free_run import resting_output
+from omsm_ros.core.sampled.free_run import check_changes, resting_output
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
 from omsm_ros.core.sampled.verdict import (
     SAMPLED_LIMITS,
@@ -33,13 +33,11 @@ from omsm_ros.core.sampled.verdict import (
     sampled_certificate,
 )
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.errors import ConfigurationError, IdentificationError
+from omsm_ros.errors import ConfigurationError
 
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
 # On a logarithmic grid over three decades: neighbours 2 % apart.
 _FREQUENCIES = 400
-# The square of a smaller change, over a noise that is smaller still, is no float.
-_LEAST_CHANGE = 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +90,8 @@ def identify_samples(
     if hold not in HOLDS:
         raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
     used = np.isfinite(output) if used is None else used & np.isfinite(output)
-    _check_changes(input[np.isfinite(input)], "input")
-    _check_changes(output[used], "output")
+    check_changes(input, "input")
+    check_changes(output[used], "output")
     if hold == BAND_LIMITED:
         return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
     choice = choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
@@ -118,15 +116,6 @@ def identify_samples(
             entries=_entries(choice, output[used]),
         ),
     )
-
-
-def _check_changes(values: FloatArray, name: str) -> None:
-    change = float(np.ptp(values)) if len(values) else 0.0
-    if change <= _LEAST_CHANGE:
-        raise IdentificationError(
-            f"the {name} changes by {change:g} in all, which tells nothing; excite it while "
-            "recording, or give it in a larger unit"
-        )
 
 
 def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Known, float]:

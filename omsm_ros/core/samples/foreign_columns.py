@@ -198,7 +198,7 @@ def period_of(times: FloatArray, stated: float | None) -> float:
     """
     TIME.checked_all(times, DataError, "time")
     if len(times) < 2:
-        raise DataError(f"{len(times)} rows of time, expected at least 2")
+        raise DataError(f"{len(times)} rows of time, expected at least 2; record more")
     steps = np.diff(times)
     if not np.all(steps > 0):
         row = int(np.argmax(steps <= 0)) + 1

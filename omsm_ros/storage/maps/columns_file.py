@@ -18,6 +18,7 @@ from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.storage.files import open_regular, whole_file
 from omsm_ros.storage.maps.length_units import (
     LengthUnits,
+    metres_in,
     name_and_unit,
     needed,
     refuse_other,
@@ -52,10 +53,10 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
             raise FileError(f"{what} has {size} bytes, at most {MAX_TEXT_BYTES} are read; thin it")
         stream.seek(0)
         header, first = _beginning(stream, what)
-        names, scales = _columns(header, first, units, what)
+        names, scales, cells = _columns(header, first, units, what)
         stream.seek(0)
         body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
-        table = _numbers(body, len(header), _delimiter(first), sorted(names.values()), what)
+        table = _numbers(body, len(header), first, cells, sorted(names.values()), what)
     at = {name: sorted(names.values()).index(place) for name, place in names.items()}
     column = {name: table[:, place] * scales[name] for name, place in at.items()}
     return measured(
@@ -63,7 +64,7 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         column["y"],
         column["height"],
         column.get("uncertainty"),
-        _notes(names, first),
+        _notes(names, cells),
         sample=column.get("sample"),
     )
 
@@ -102,16 +103,24 @@ def _delimiter(line: str) -> str | None:
     return next((mark for mark in ";," if mark in line), None)
 
 
+def _cells(line: str) -> tuple[int, int]:
+    """Return how many cells a line of numbers has, without and with empty ones at its end."""
+    mark = _delimiter(line)
+    full = line.rstrip(f" {mark}") if mark else line
+    return len(full.split(mark)), len(line.split(mark))
+
+
 def _columns(
     header: list[str], first: str, units: LengthUnits | None, what: str
-) -> tuple[dict[str, int], dict[str, float]]:
-    """Return the place of each column by its role, and metres in one of its numbers."""
-    count = len([part for part in re.split(r"[,;]|\s+", first.strip("; ,")) if part])
-    named = next(filter(None, (_named(line, count) for line in reversed(header))), {})
+) -> tuple[dict[str, int], dict[str, float], int]:
+    """Return place and metres in one number of each column by its role, and cells in a line."""
+    named, count = _roles(header, _cells(first), what)
     places = {role: place for role, (place, _) in named.items()}
     if not named:
         if count < 3:
-            raise FileError(f"{what} has {count} columns, expected x, y and height in each line")
+            raise FileError(
+                f"{what} has {count} columns, expected x, y and height in each line; write it again"
+            )
         places = {"x": 0, "y": 1, "height": 2}
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
@@ -124,7 +133,7 @@ def _columns(
         else:
             given = needed(units, what)
             scales[role] = given.lateral if role in "xy" else given.height
-    return places, scales
+    return places, scales, count
 
 
 def _agreed(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
@@ -135,35 +144,82 @@ def _agreed(units: LengthUnits | None, role: str, stated: float, what: str) -> N
     refuse_other(units, LengthUnits(*own), what)
 
 
-def _named(line: str, count: int) -> dict[str, tuple[int, float | None]]:
-    """Return place and unit of each column by its role, if the line names x, y and a height."""
-    text = line.lstrip("#!% ").replace("/t", "\t")
-    parts = [part for part in re.split(r"[,;\t]", text) if part.strip()]
-    if len(parts) < 3:
-        parts = re.sub(r"\s+(?=[\[(])", "", text).split()
-    known = [name_and_unit(part) for part in parts]
+def _roles(
+    header: list[str], cells: tuple[int, int], what: str
+) -> tuple[dict[str, tuple[int, float | None]], int]:
+    """Return place and unit of each column by its role, none if no line names them, and the cells.
+
+    Raises FileError where the line of names has more or fewer than the numbers have columns, names
+    one twice, or states another unit than a line of units below it.
+    """
+    for place in reversed(range(len(header))):
+        names = _names(header[place])
+        found = _named(names)
+        if not {"x", "y", "height"} <= set(found):
+            continue
+        if not cells[0] <= len(names) <= cells[1]:
+            if header[place].startswith(_COMMENTS):  # words that happen to be such names
+                continue
+            raise FileError(
+                f"{what}: line {place + 1} names {len(names)} columns, below it stand numbers in "
+                f"{cells[0]}; name each column once, and write decimal points"
+            )
+        for role, (at, _) in found.items():
+            if names.count(names[at]) > 1 or sum(name_and_unit(n)[0] == role for n in names) > 1:
+                raise FileError(f"{what} has the column {names[at]!r} twice; name each once")
+        return _with_units(found, header[place + 1 :], what), len(names)
+    return {}, cells[0]
+
+
+def _names(line: str) -> list[str]:
+    """Return the cells of what may be a line of names; an empty one counts between delimiters."""
+    text = line.lstrip("#!% ").replace("/t", "\t").rstrip(" ,;\t")
+    if _delimiter(text):
+        return [part.strip().strip('"') for part in re.split("[,;]", text)]
+    parts = [part.strip() for part in text.split("\t") if part.strip()]
+    return parts if len(parts) >= 3 else re.sub(r"\s+(?=[\[(])", "", text).split()
+
+
+def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
+    """Return place and unit by role, of the columns that have one."""
     found: dict[str, tuple[int, float | None]] = {}
-    for place, (name, unit) in enumerate(known):
+    for place, (name, unit) in enumerate(map(name_and_unit, names)):
         role = _ROLES.get(name)
         # A cloud of ours has its height twice, and "height" is the one of full precision.
         if role and (role not in found or name == "height"):
             found[role] = (place, unit)
-    whole = {"x", "y", "height"} <= set(found) and len(parts) == count
-    return found if whole else {}
+    return found
+
+
+def _with_units(
+    found: dict[str, tuple[int, float | None]], below: list[str], what: str
+) -> dict[str, tuple[int, float | None]]:
+    """Return ``found`` with the units of a line of units, if one stands below the names."""
+    for line in below:
+        units = [metres_in(name.strip("[]() ")) for name in _names(line)]
+        for role, (place, own) in found.items():
+            stated = units[place] if place < len(units) else None
+            if own is not None and stated is not None and stated != own:
+                raise FileError(
+                    f"{what} states two units of {role}, by its name and on the line below it; "
+                    "delete the wrong one"
+                )
+            found[role] = (place, stated if own is None else own)
+    return found
 
 
 def _numbers(
-    body: io.TextIOBase, skip: int, delimiter: str | None, columns: list[int], what: str
+    body: io.TextIOBase, above: int, first: str, cells: int, columns: list[int], what: str
 ) -> FloatArray:
     remedy = (
         "write decimal points, a height that is missing as nan, and the same columns on every line"
     )
-    layout = {"comments": list(_COMMENTS), "delimiter": delimiter, "usecols": columns}
-    return rows_in(body, what, remedy, skiprows=skip, **layout)
+    layout = {"comments": list(_COMMENTS), "delimiter": _delimiter(first), "usecols": columns}
+    lines = islice(body, above, None)
+    return rows_in(lines, what, remedy, above=above, cells=cells, **layout)
 
 
-def _notes(names: Mapping[str, int], first: str) -> tuple[str, ...]:
-    count = len([part for part in re.split(r"[,;\s]+", first) if part])
+def _notes(names: Mapping[str, int], count: int) -> tuple[str, ...]:
     return (f"{count - len(names)} other columns were left out",) if count > len(names) else ()
 
 

@@ -71,7 +71,7 @@ def load_dabam(path: Path) -> DabamProfile:
         )
     with open_regular(path, FileError, "profile") as stream:
         lines = stream.read(_MAX_DATA_BYTES).decode("utf-8", "replace").splitlines()[skip:]
-    table = rows_in(lines, what, "check FILE_HEADER_LINES", usecols=(0, 1))
+    table = rows_in(lines, what, "check FILE_HEADER_LINES", above=skip, usecols=(0, 1))
     if not len(table):
         raise FileError(
             f"{what} has no points after its {skip} lines of header; check FILE_HEADER_LINES"

@@ -66,9 +66,9 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
     what = f"grid sag {str(path)!r}"
     with open_regular(path, FileError, "grid sag") as stream:
         text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
-        line = text.readline(_LONGEST_LINE)
+        line, above = text.readline(_LONGEST_LINE), 1
         while line.startswith(_COMMENT) or line.isspace():
-            line = text.readline(_LONGEST_LINE)
+            line, above = text.readline(_LONGEST_LINE), above + 1
         first = _first_line(line)
         if first is None:
             raise FileError(
@@ -84,7 +84,7 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
         refuse_other(units, LengthUnits(scale, scale), what)
         columns, rows = int(first[0]), int(first[1])
         MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
-        table = rows_in(text, what, "write a line a point", comments=_COMMENT)
+        table = rows_in(text, what, "write a line a point", above=above, comments=_COMMENT)
     if len(table) != columns * rows:
         raise FileError(
             f"{what} says {columns} × {rows} points and has {len(table)}; write it again"

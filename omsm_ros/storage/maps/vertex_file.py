@@ -141,7 +141,8 @@ def _records(
     if not ascii_text:
         # Mapped: the columns are taken out of it one by one.
         return np.memmap(stream, dtype, mode="r", offset=begin, shape=(count,))
-    columns = rows_in(stream, what, "write a line a point", max_rows=count).T
+    lines = (line.decode("latin-1") for line in stream)
+    columns = rows_in(lines, f"{what}, below its header", "write a line a point", max_rows=count).T
     if columns.shape != (len(dtype), count):
         raise FileError(
             f"{what} says {count} points of {len(dtype)} numbers; it was cut short, write it again"

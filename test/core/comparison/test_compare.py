@@ -1,5 +1,7 @@
 """Two measurements of one part agree when they should, and differ when they should."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
@@ -283,3 +285,10 @@ def test_a_small_overlap_cannot_tell():
 def test_an_unknown_freedom_is_refused():
     with pytest.raises(ConfigurationError, match="freedom 'z' is unknown"):
         compare(mapped(), mapped(), ("piston", "z"))
+
+
+def test_heights_of_so_few_digits_that_they_do_not_scatter_are_compared():
+    first, second = mapped(stated=1e-9), mapped(stated=1e-9, seed=3)
+    coarse = replace(second.points, height=np.round(second.points.height, 4))
+    found = compare(first, replace(second, points=coarse))
+    assert found.verdict.verdict == DIFFER

@@ -122,3 +122,11 @@ def test_the_resting_output_of_a_single_step():
 def test_the_least_record_is_enough():
     u, y = moving()
     assert free_run(smooth(), u[:50], y[:50]).rms < 1e-3
+
+
+@pytest.mark.parametrize("still", ["input", "output"])
+def test_of_a_record_that_stands_still_nothing_is_accounted_for(still):
+    """A constant output is matched to the last digit by any model and the constant fitted to it."""
+    columns = {"input": np.sin(TIME), "output": np.sin(TIME), still: np.ones(len(TIME))}
+    with pytest.raises(IdentificationError, match=f"the {still} changes by 0 in all"):
+        free_run(held(), **columns)

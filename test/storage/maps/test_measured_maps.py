@@ -111,7 +111,7 @@ def test_slopes_of_a_circle_integrate_to_it(tmp_path):
         (HEADER.replace('FORMAT": 2', 'FORMAT": 7'), None, "FILE_FORMAT 7"),
         (HEADER.replace("0.001", "null"), None, "factors"),
         (HEADER.replace("1e-9", "-1"), None, "factors"),
-        (HEADER, "x h\n1 2\n3 four\n", "is no table"),
+        (HEADER, "x h\n1 2\n3 four\n", "line 3: '3 four' is no row"),
         (HEADER, "x h\n", "no points"),
     ],
 )

@@ -135,12 +135,16 @@ def test_a_height_that_is_missing_is_counted(tmp_path):
         ("", "is empty"),
         ("hello\nworld\n", "no line of numbers"),
         ("x_mm y_mm\n1 2\n3 4\n", "has 2 columns, expected x, y and height"),
-        ("x_m y_m z_m\n1 2 3\n4 5 six\n", "is no table.*decimal points"),
-        ("x_m;y_m;z_m\n1.5;2.5;3.5\n1,5;2,5;3,5\n", "is no table.*decimal points"),
-        ("x_m y_m z_m\n1 2 3\n4 5\n", "is no table"),
+        ("x_m y_m z_m\n1 2 3\n4 5 six\n", "is no row of numbers.*decimal points"),
+        ("x_m;y_m;z_m\n1.5;2.5;3.5\n1,5;2,5;3,5\n", "is no row of numbers.*decimal points"),
+        ("x_m y_m z_m\n1 2 3\n4 5\n", "line 3: '4 5' is no row"),
         ("x_m y_m z_m\n1 2 nan\n", "surface of no points"),
         ("x_m y_m z_m\n1 2 3\n1e9 2 3\n", "give it in metres"),
         ("x_m y_m z_m\n1 2 3\ninf 2 3\n", "give it in metres"),
+        ("x_mm,y_mm,z_mm\n1,5,2,5,3,5\n", "line 1 names 3 columns, .* in 6"),  # decimal commas
+        ("x_mm,y_mm,z_mm\n1,2,3\n1,5,2,3\n", "line 3: '1,5,2,3' is no row"),
+        ("x_mm,y_mm,z_mm,z_mm\n1,2,3,4\n", "'z_mm' twice"),
+        ("x_m,y_m,z_m\nmm,mm,mm\n1,2,3\n", "two units of x"),
         ("\n" * 60 + "1 2 3\n", "no line of numbers among its first 50"),
     ],
 )
@@ -148,6 +152,22 @@ def test_what_is_no_map_is_told_in_one_line(tmp_path, text, told):
     with pytest.raises(FileError, match=told) as refused:
         read_points(_text(tmp_path, text))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ",x_mm,y_mm,z_um\n0,1,2,3\n1,4,5,6\n",  # as pandas numbers its lines
+        "x,y,z\n[mm],[mm],[um]\n1,2,3\n4,5,6\n",  # units on a line of their own
+        "x_mm;y_mm;z_um;remark\n1;2;3;\n4;5;6;7\n",
+        "x_mm,y_mm,z_um\n1,2,3\n  \n4,5,6\n\t\n",
+    ],
+)
+def test_the_columns_of_a_text_are_where_its_names_say(tmp_path, text):
+    points = read_points(_text(tmp_path, text))
+    assert points.x == pytest.approx([1e-3, 4e-3])
+    assert points.y == pytest.approx([2e-3, 5e-3])
+    assert points.height == pytest.approx([3e-6, 6e-6])
 
 
 @pytest.mark.parametrize("text", ["furlong", "mm,nm,m", "", "mm,", "1e-3"])
@@ -215,7 +235,7 @@ def test_the_slopes_of_a_grid_sag_are_those_of_the_surface(tmp_path):
     ("text", "told"),
     [
         ("6 5 0.5 0.25 0 0 0\n1 0 0 0\n", r"says 6 × 5 points and has 1"),
-        ("6 5 0.5 0.25 0 0 0\nz\n", "is no table"),
+        ("6 5 0.5 0.25 0 0 0\nz\n", "line 2: 'z' is no row"),
         ("90000 90000 0.5 0.25 0 0 0\n1\n", "number of points is 8100000000"),
         ("6 5 0.5 0.25 9 0 0\n1 0 0 0 0\n", r"unit 9, the fifth .* 0 \(mm\), .* 3 \(m\)"),
         ("! by hand\n6 5 0.5 0.25 -1\n1\n", "has unit -1"),
