@@ -55,7 +55,7 @@ setup(
     package_dir={INTERFACES: os.path.relpath(ROOT / "msg_defs")},
     package_data={
         INTERFACES: ["msg/*.msg", "srv/*.srv"],
-        PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml"],
+        PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml", "**/*.xml"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

@@ -24,6 +24,9 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, and that it ends with."""
 
+_PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+_PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # is read too, where it exists
+_TRANSPORTS_CHOSEN = (_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
 _BAD_INPUT = 2
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OTHER_NAMES = {"replay": "player"}
@@ -45,6 +48,7 @@ def main() -> None:
         end_with_launch()
         share_one_pool()
         send_aside()
+        hear_by_udp()
         for package, remedy in _NEEDED.items():
             try:
                 importlib.import_module(package)
@@ -78,6 +82,19 @@ def send_aside() -> None:
     message at all, and what follows it reaches that listener only when the queue has run over.
     """
     os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "ASYNCHRONOUS")
+
+
+def hear_by_udp() -> None:
+    """Let Fast DDS bring messages by UDP, not through shared memory, unless the user has chosen.
+
+    A listener that stands still for a second or two has its queue in shared memory replaced, and
+    what waited there holds its places in the sender's memory, which soon has room in small pieces
+    alone. What was missed is sent again in large ones: each fails without a word, again and again,
+    and the listener hears nothing more of that sender until something else frees the memory.
+    """
+    chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
+    if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
+        os.environ[_PROFILES] = str(Path(__file__).with_name("fast_dds.xml"))
 
 
 if __name__ == "__main__":

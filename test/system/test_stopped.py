@@ -1,0 +1,91 @@
+"""Nodes that are stopped for seconds and continued, as a busy machine or a debugger does it."""
+
+import itertools
+import multiprocessing
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import rclpy
+from std_srvs.srv import Trigger
+from system.test_soak import longest_delay_s
+
+STOPS, STOP_S, PAUSE_S = 60, 2.0, 3.0
+WORK_S = 2.0  # what a node needs on a busy computer, to take two seconds of messages and its own
+
+
+def queues_in_shared_memory(pid):
+    """Numbers of the queues in shared memory that a process has locked for itself, to hear by."""
+    found = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            found |= set(re.findall(r"fastrtps_port(\d+)_el$", os.readlink(entry)))
+        except OSError:  # closed meanwhile
+            continue
+    return found
+
+
+def test_nodes_do_not_hear_through_shared_memory_unless_told(cell, monkeypatch):
+    assert queues_in_shared_memory(os.getpid())  # as a process does that is none of ours
+    cell.start_emulator()
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")
+    cell.start_driver()
+    for node in ("cell_emulator", "confocal_driver"):
+        cell.wait(node, lambda n=node: cell.operator.text(n, "lifecycle") == "active")
+    assert not queues_in_shared_memory(cell.processes.pid("cell_emulator"))
+    assert queues_in_shared_memory(cell.processes.pid("confocal_driver"))
+
+
+@pytest.fixture
+def busy():
+    """A loop for each processor."""
+    loops = [multiprocessing.Process(target=_turn, daemon=True) for _ in range(os.cpu_count())]
+    for loop in loops:
+        loop.start()
+    yield
+    for loop in loops:
+        loop.kill()
+        loop.join()
+
+
+def _turn():
+    while True:
+        pass
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+def test_clouds_come_as_late_as_a_node_was_stopped(cell, true_calibration, busy):
+    radius = 9e-3
+    minutes = STOPS * (STOP_S + PAUSE_S) / 60
+    cell.start_correcting(
+        true_calibration,
+        time_lapse=1.0,
+        start_radius=radius,
+        feed_per_turn=radius / (30 * (minutes + 1)),
+    )
+    bag = cell.folder / "scan.mcap"
+    cell.processes.start("recorder", path=str(bag))
+    cell.wait("the recorder", lambda: cell.operator.text("recorder", "lifecycle") == "active")
+    assert cell.call(Trigger, "cell_emulator/scan").success
+    nodes = itertools.cycle(("recorder", "corrector", "recorder", "confocal_driver"))
+    for node in itertools.islice(nodes, STOPS):
+        let_pass(cell, PAUSE_S)
+        os.kill(cell.processes.pid(node), signal.SIGSTOP)
+        let_pass(cell, STOP_S)
+        os.kill(cell.processes.pid(node), signal.SIGCONT)
+    let_pass(cell, PAUSE_S)
+    cell.processes.end("recorder")
+    delay = longest_delay_s(bag)
+    print(f"{STOPS} stops of {STOP_S} s: clouds came after at most {delay:.1f} s")
+    assert delay < STOP_S + WORK_S
+
+
+def let_pass(cell, seconds):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        rclpy.spin_once(cell.operator, timeout_sec=0.1)
+    cell.processes.check()
