@@ -80,20 +80,20 @@ class Cells:
 
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
         """Return images (…, r, c) under the Gaussian of ``cutoff`` wavelength [m] (16610-61)."""
-        rows, columns = (_weights(size, cutoff / self.pitch) for size in self.present.shape)
+        rows, columns = (gaussian_weights(size, cutoff / self.pitch) for size in self.present.shape)
         weight = rows @ self.present @ columns
         made = rows @ (images * self.present) @ columns
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) * self.present)
 
     def smoothed_square(self, variance: FloatArray, cutoff: float) -> FloatArray:
         """Return the variance (r, c) of independent cells after :meth:`smoothed`."""
-        rows, columns = (_weights(size, cutoff / self.pitch) for size in self.present.shape)
+        rows, columns = (gaussian_weights(size, cutoff / self.pitch) for size in self.present.shape)
         weight = rows @ self.present @ columns
         made = rows**2 @ (variance * self.present) @ columns**2
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) ** 2 * self.present)
 
 
-def _weights(size: int, cutoff: float) -> FloatArray:
+def gaussian_weights(size: int, cutoff: float) -> FloatArray:
     """Return the weights (size, size) of each cell for each other; ``cutoff`` in cells."""
     apart = np.subtract.outer(np.arange(size), np.arange(size)) / (_ALPHA * cutoff)
     return np.asarray(np.exp(-np.pi * apart**2))

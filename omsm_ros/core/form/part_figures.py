@@ -8,8 +8,8 @@ all there is. So with F of the deviations and F' of the deviations with errors d
     F² of the part = 2 F² − mean F'²
 
 (simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Noise from
-point to point is first averaged out by smooth terms; of what they leave, the share that is no noise
-stays.
+point to point is first averaged out by smooth terms and means of neighbours; of what they leave,
+the share that is no noise stays. Noise that is left counts as an error.
 
 What the fit of the pose may have taken away is no error that was added: form that looks like a move
 is missing from the deviations. Their form and it are independent of each other (the estimate and
@@ -26,6 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from omsm_ros.core.form.figures import DeviationMap, Figure, weighted_quantiles
+from omsm_ros.core.form.local_means import closest_means
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -40,6 +41,8 @@ _ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws know a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
+# Of the noise of the points: its mean effect is known to a sixth of its spread.
+_NOISES = 40
 
 
 def rms_of_part(map_: DeviationMap) -> Figure:
@@ -73,11 +76,11 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     disc: on which the smooth terms are
     """
     few = map_.every(_MOST_FITTED)
-    fit = _smooth(few, disc)
-    base, noise = _without_noise(few, fit)
+    noises = few.noise * np.random.default_rng(_SEED + 1).normal(size=(_NOISES, len(few)))
+    fit = _smooth(few, disc, noises)
+    base, left, blurred = _without_noise(few, fit, noises)
     chosen = slice(None, None, -(-len(few) // _MOST_DRAWN))
-    ways = _drawn(few, fit, base, chosen)
-    scatter = _scattered(base[chosen], noise)
+    ways = _drawn(few, fit, base, left, chosen)
     area = few.area[chosen]
 
     def robust(deviations: FloatArray, area: FloatArray) -> FloatArray:
@@ -91,49 +94,74 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
     for extent in (whole, robust):
         of_all = float(extent(base[:, np.newaxis], few.area)[0])
         of_some = float(extent(base[chosen][:, np.newaxis], area)[0])
-        again, more, likely, full = (extent(drawn, area) ** 2 for drawn in ways)
+        again, more, likely, full, noisy = (extent(drawn, area) ** 2 for drawn in ways)
         square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
         of_taken = _rms(full - np.mean(likely))
-        of_noise = float(np.std(extent(scatter, area) ** 2))
-        spread = _length(float(np.std(again)), _rms(more - again), of_taken, of_noise)
+        # Where many points compete for an extreme, the mean of draws follows the figure's own
+        # noise but in part, so that twice its square has once to twice of it: √2.
+        of_errors = _length(float(np.std(again)), float(np.std(noisy)))
+        # Of the two points that an extent is between.
+        of_blur = 2 * of_some * float(np.sqrt(2)) * blurred
+        spread = _length(of_errors, _rms(more - again), of_taken, of_blur)
         figure = _of_square(square, spread)
         found.append(Figure((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
 
 
-def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
-    """Return smooth terms of the deviations, of as high an order as the points allow."""
+def _smooth(map_: DeviationMap, disc: Aperture, noises: FloatArray) -> ZernikeFit:
+    """Return smooth terms of the deviations, of as high an order as the points allow.
+
+    noises: draws of it (d, n) [m], whose terms are its effects
+    """
     orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)]
     terms = terms_up_to(orders[0] if orders else 0)
     points = (map_.x, map_.y, map_.deviation)
-    return fit_zernikes(*points, terms, disc, weights=map_.area)
+    return fit_zernikes(*points, terms, disc, weights=map_.area, effects=noises)
 
 
-def _without_noise(map_: DeviationMap, fit: ZernikeFit) -> tuple[FloatArray, float]:
-    """Return the smooth deviations (n,), and of the rest the share that is no noise (Wiener).
+def _without_noise(
+    map_: DeviationMap, fit: ZernikeFit, noises: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the deviations with as little noise as can be (n,), and what is left of it (d, n).
 
-    And the noise of a point that is left in that share [m].
+    And how much form is lost with it, rms.
+
+    Smooth terms; of what they leave, means around each point, where these come closer to it than
+    single points; of what those leave, the share that is no noise (Wiener). ``noises`` are draws
+    (d, n) that go the same way; what the terms follow of them is in the covariance of the terms.
     """
-    smooth = fit.height(map_.x, map_.y)
-    rest = map_.deviation - smooth
-    variance = float(np.mean(rest**2))
-    share = max(1 - map_.noise**2 / variance, 0.0) if variance > 0 else 0.0
-    return np.asarray(smooth + share * rest, np.float64), share * map_.noise
+    terms = zernike_values(*fit.disc.scaled(map_.x, map_.y), fit.terms)
+    smooth = fit.coefficients @ terms
+    rest, noise = map_.deviation - smooth, noises - fit.effects.T @ terms
+    share, lost = _share_of_form(rest, map_.noise)
+    found = closest_means(map_.x, map_.y, rest, map_.noise)
+    if found.error >= share * map_.noise**2:
+        return np.asarray(smooth + share * rest, np.float64), share * noise, lost
+    near, noise_near = found.means(rest), np.array([found.means(each) for each in noise])
+    share, lost = _share_of_form(rest - near, map_.noise * float(np.sqrt(found.rest)))
+    base = smooth + near + share * (rest - near)
+    return np.asarray(base, np.float64), noise_near + share * (noise - noise_near), lost
 
 
-def _scattered(base: FloatArray, noise: float) -> FloatArray:
-    """Return deviations (m, draws) whose points lie elsewhere within the noise left in them."""
-    random = np.random.default_rng(_SEED + 1)
-    return np.asarray(base[:, np.newaxis] + noise * random.normal(size=(len(base), _DRAWS)))
+def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
+    """Return which share of ``values`` (n,) comes closest to them without their ``noise``.
+
+    And what it lacks of them then, rms.
+    """
+    variance = float(np.mean(values**2))
+    share = max(1 - noise**2 / variance, 0.0) if variance > 0 else 0.0
+    return share, (1 - share) * float(np.sqrt(max(variance - noise**2, 0.0)))
 
 
 def _drawn(
-    map_: DeviationMap, fit: ZernikeFit, base: FloatArray, chosen: slice
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    map_: DeviationMap, fit: ZernikeFit, base: FloatArray, left: FloatArray, chosen: slice
+) -> tuple[FloatArray, ...]:
     """Return some of the deviations with errors drawn anew (m, draws).
 
     The second has besides what may be there of the upper bounds. The others have, instead of
-    errors, what the fit is likely to have taken away, and what it may have.
+    errors, what the fit is likely to have taken away, what it may have, and the noise left alone.
+
+    base: without errors (n,);  left: draws of the noise that is left in it (d, n)
     """
     random = np.random.default_rng(_SEED)
     terms = zernike_values(*fit.disc.scaled(map_.x[chosen], map_.y[chosen]), fit.terms)
@@ -143,9 +171,10 @@ def _drawn(
     def anew(ways: FloatArray) -> FloatArray:
         return np.asarray(ways.T @ random.normal(size=(len(ways), _DRAWS)), np.float64)
 
-    drawn = still + anew(np.concatenate([effects[_real(map_)], _root(fit.covariance) @ terms]))
+    noisy = still + np.tile(left[:, chosen].T, _DRAWS // _NOISES)
+    drawn = noisy + anew(np.concatenate([effects[_real(map_)], _root(fit.covariance) @ terms]))
     bounded = drawn + anew(effects[map_.bounds])
-    return drawn, bounded, still + anew(_root(map_.taken) @ taken), still + anew(taken)
+    return drawn, bounded, still + anew(_root(map_.taken) @ taken), still + anew(taken), noisy
 
 
 def _root(products: FloatArray) -> FloatArray:

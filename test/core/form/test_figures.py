@@ -74,6 +74,21 @@ def test_noise_is_not_taken_for_form(noise):
             assert figure.uncertainty < 1e-9 + 0.5 * noise
 
 
+def test_noise_that_is_left_does_not_make_a_part_with_rings_larger():
+    """80 nm of rings that no smooth term follows, on 1.2 µm of form, under 14 nm of noise.
+
+    Single points keep most of their noise there: 22 nm too large on average, of 14 nm stated.
+    """
+    u, v = X / DISC.radius, Y / DISC.radius
+    rings = 40e-9 * np.cos(2 * np.pi * np.hypot(X, Y) / 1.2e-3)
+    true = 400e-9 * (u**2 - v**2) + 200e-9 * (u**3 - 3 * u * v**2) + rings
+    found = [
+        figures(measured(true, 14e-9, EFFECTS[:0], seed))["pv"].value - np.ptp(true)
+        for seed in range(7)
+    ]
+    assert abs(np.mean(found)) < 12e-9
+
+
 @pytest.mark.parametrize(
     "size",
     [0.1, pytest.param(1.0, marks=pytest.mark.soak), pytest.param(0.0, marks=pytest.mark.soak)],
