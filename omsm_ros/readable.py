@@ -9,6 +9,7 @@ reader is to type back stays in the unit of its field instead.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime, timezone
 
 from omsm_ros.units import DAY_S, NANOSECONDS_PER_S
@@ -29,6 +30,12 @@ _FIGURES = {
 }
 _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """Return counts in words, those of none left out: ``3 not ok, 1 duplicate``."""
+    words = [f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n]
+    return ", ".join(words) or "none"
 
 
 def number(value: object) -> float | None:

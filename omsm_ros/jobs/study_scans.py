@@ -31,6 +31,7 @@ from omsm_ros.errors import BagError
 from omsm_ros.jobs.corrected_scan import CorrectedScan
 from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.jobs.read_bag import sample_period_in
+from omsm_ros.readable import counted
 from omsm_ros.storage.recording.topics import AnyBag
 
 # What is to be found must not be in the points already.
@@ -135,6 +136,8 @@ def alignment_of(
 def _check_points(scan: CorrectedScan) -> None:
     if not scan.account.axes.corrected:
         raise BagError(
-            f"{str(scan.path)!r} gives no surface point: {scan.account.as_dict()!r}; "
+            f"{str(scan.path)!r} gives no surface point: of {scan.account.distance.received} "
+            f"readings {counted(scan.account.distance.counted)}, of "
+            f"{scan.account.axes.received} axis samples {counted(scan.account.axes.counted)}; "
             "look at it with 'omsm inspect'"
         )

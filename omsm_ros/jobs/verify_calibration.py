@@ -7,6 +7,7 @@ import numpy as np
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.recursion import through
+from omsm_ros.core.fitting.steps import check_usable
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
@@ -29,6 +30,7 @@ def path_check_of(
     by_stamps: join both by their stamps, not by their counters
     """
     record = motion_of_bag(path, trigger=trigger, by_stamps=by_stamps, progress=progress)
+    check_usable(record)
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     return check_path(
         record.z,

@@ -110,3 +110,11 @@ def test_compare_of_three_or_more_says_how_well_they_repeat(capsys, tmp_path, tr
     assert alike["delay"]["deviation"] == pytest.approx(1e-6)
     assert len(alike["phase_deviation"]) == len(alike["frequency"])
     assert not facts(capsys, "compare", *paths)["repeatable"]
+
+
+def test_verify_without_a_reading_says_so(capsys, tmp_path, calibration):
+    made = record(Cell(seed=2), Chirp(duration=5.0), Flat())
+    dark = replace(made.distance, distance=np.full(len(made.distance), np.nan))
+    bag = write(tmp_path / "dark.mcap", replace(made, distance=dark))
+    assert cli.main(["verify", str(bag), "--calibration", str(calibration)]) == 2
+    assert "0 of 5000 samples are usable (5000 received, 5000 not ok)" in capsys.readouterr().err

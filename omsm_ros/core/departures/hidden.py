@@ -52,7 +52,8 @@ class HiddenTerm:
     """One family that could hide.
 
     size, uncertainty: of the most significant term of the family, in its unit
-    missed: largest size that the test would have missed with 5 % probability
+    missed: largest size that the test would have missed with 5 % probability; inf where it
+        shows none
     shift: (p,) of the coefficients per unit, if the term is left out
     gain, late: (p,) change of the coefficients that scales the whole response by one, and that
         delays it by a second

@@ -52,7 +52,9 @@ class TransferFunction:
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.denominator[0] != 1.0:
-            raise DataError(f"denominator[0] is {self.denominator[0]!r}, expected 1")
+            raise DataError(
+                f"denominator[0] is {float(self.denominator[0]):g}, expected 1; divide all by it"
+            )
         if self.denominator[-1] == 0:
             raise DataError("the last coefficient of the denominator is 0; leave it out")
         if len(self.numerator) > len(self.denominator):

@@ -171,10 +171,13 @@ def _static_gain(problem: Problem) -> float:
     return float(least_squares(columns, problem.output[problem.used])[0])
 
 
-def check_gain(gain: float) -> None:
-    """Raise IdentificationError unless the probe follows the motion about one to one."""
+def check_gain(gain: float, *, slack: float = 1.0) -> None:
+    """Raise IdentificationError unless the probe follows the motion about one to one.
+
+    slack: by how much further from one it may be
+    """
     low, high = _PLAUSIBLE_GAIN
-    if not low <= abs(gain) <= high:
+    if not low / slack <= abs(gain) <= high * slack:
         raise IdentificationError(
             f"the probe moves by {plain(gain)} per travel of the axis, expected about 1: check "
             "that it looks at a fixed target within its range, that both are in metres, and that Z "
@@ -185,6 +188,11 @@ def check_gain(gain: float) -> None:
 def _check_not_clipped(problem: Problem) -> None:
     motion, output = problem.input[problem.used], problem.output[problem.used]
     levels = np.unique(output)
+    if len(levels) < 2:
+        raise IdentificationError(
+            "the distance does not change while the axis moves; check that the probe is "
+            "connected, sees its target and is not held at the end of its range"
+        )
     quantum = float(np.min(np.diff(levels)))
     allowed = max(20 * sample_noise(output), 3 * quantum, 2e-3 * float(np.ptp(motion)))
     for name, extreme in (("greatest", levels[-1]), ("least", levels[0])):

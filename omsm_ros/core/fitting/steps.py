@@ -15,7 +15,7 @@ from scipy import special
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
-from omsm_ros.readable import quantity
+from omsm_ros.readable import counted, quantity
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
 LEAST_SAMPLES = 50
@@ -159,7 +159,7 @@ def check_usable(record: MotionRecord) -> None:
     usable = int(np.sum(record.ok))
     if usable < LEAST_SAMPLES:
         raise StepTestError(
-            f"{usable!r} of {len(record)} samples are usable (counts {dict(record.counts)!r}); "
+            f"{usable!r} of {len(record)} samples are usable ({counted(record.counts)}); "
             "check the probe's target and range, and the encoder"
         )
 

@@ -22,7 +22,7 @@ from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.readable import percent, quantity
+from omsm_ros.readable import number, percent, quantity
 
 
 def hidden_covariance(
@@ -139,11 +139,11 @@ def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
         "parameter": term.parameter,
         "size": term.size,
         "uncertainty": term.uncertainty,
-        "missed": term.missed,
+        "missed": number(term.missed),
         "carried": carried,
         "prior": priors.get(term.family),
         "effect_on_scan_m": term.effect * carried,
-        "missed_effect_on_scan_m": term.effect * term.missed,
+        "missed_effect_on_scan_m": number(term.effect * term.missed),
     }
 
 

@@ -35,7 +35,7 @@ from omsm_ros.core.identification.departure_search import search
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.core.identification.hidden_terms import hidden_covariance, other_modes
-from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.identification.model_choice import Model, model_from_start
 from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
 from omsm_ros.core.identification.two_masses import table_mass
 from omsm_ros.core.samples.motion_record import MotionRecord
@@ -45,6 +45,9 @@ DEFAULT_LIMITS = ResponseLimits()
 Parameters = ParamSpec("Parameters")
 # A calibration that is trusted nowhere says so by a frequency below anything that moves.
 _TRUSTED_NOWHERE_HZ = 1e-3
+# What creep, drift or play beside the first model may still change of its gain; beyond it the probe
+# saw something else, and to look for departures in that takes half a minute.
+_STILL_THE_SAME_SIGNAL = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +104,13 @@ def identify(
     be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
     mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
-    searched = search(
-        prepare(record, input),
-        lambda prepared: model_from_start(prepared, order),
-        may_grow=not order,
-    )
+
+    def choose(prepared: Prepared) -> tuple[Prepared, Model]:
+        prepared, model = model_from_start(prepared, order)
+        check_gain(model.chosen.fit.gain, slack=_STILL_THE_SAME_SIGNAL)
+        return prepared, model
+
+    searched = search(prepare(record, input), choose, may_grow=not order)
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
     drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]

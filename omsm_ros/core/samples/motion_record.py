@@ -273,6 +273,12 @@ def _by_stamp(
     """Join by counter, once the axis is where a trigger of the grid would have latched it."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
     finer = max(int(np.ceil(probe_period / axis_period - SAME_PERIOD)), 1)
+    if (samples := finer * sum(len(block) for block in distance)) > MAX_RECORD_SAMPLES:
+        raise DataError(
+            f"{len(distance)} distance blocks every {probe_period:g} s on the grid of axes every "
+            f"{axis_period:g} s are {samples} samples, expected at most {MAX_RECORD_SAMPLES}: "
+            "check both sample periods, or cut the recording"
+        )
     grid = [_refined(block, finer) for block in _ordered(distance)]
     moved = axes_at_probe(_ordered(axes), grid)
     second = []

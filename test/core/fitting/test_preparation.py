@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.fitting.periodic_input import close_period
 from omsm_ros.core.fitting.preparation import from_rest_to_rest, input_bandwidth, prepare
-from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.machine.trajectories import Chirp, StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError
 
@@ -116,3 +116,9 @@ def test_a_fade_shorter_than_a_sample_changes_nothing(samples: int, period: floa
 def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
     motion = 1e-300 * np.arange(100.0)
     assert input_bandwidth(motion, 1e-3) == pytest.approx(1 / (100 * 1e-3))
+
+
+def test_a_distance_that_stands_still_beside_a_sweep_is_refused():
+    z = Chirp().positions(np.arange(8000) * 1e-3).z
+    with pytest.raises(IdentificationError, match=r"does not change .* probe is connected"):
+        prepare(MotionRecord.from_arrays(1e-3, z, np.full(8000, 3e-6)), "encoder")

@@ -118,3 +118,11 @@ def refusal(record):
     except IdentificationError as error:
         return str(error)
     return certificate["reasons"][0]
+
+
+def test_what_the_motion_cannot_show_at_all_is_unknown_and_the_calibration_can_be_written():
+    """Of a half sweep, in which a relaxation of a minute is wholly taken for drift."""
+    made = identified(Chirp(), Plant(), slice(12_500, None), 3)
+    assert made.certificate["verdict"] == "rejected"
+    assert made.certificate["could_hide"][0]["missed"] is None
+    assert len(made.id) == 64  # of its content as strict JSON
