@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from hostile import bag_inputs, inputs, maps, trees
+from hostile import bag_inputs, inputs, maps, shop, trees
 from hostile.arguments import SETTINGS, arguments
 from hostile.judge import Case
 from hypothesis import strategies as st
@@ -142,6 +142,35 @@ def through_tables(place: Path, blocks: Any) -> Cases:
     return _with([words], maps.damaged_tables(_good(place, maps.TABLES)))
 
 
+_RECORD = ("--input", "time_s", "--output", "z_m")
+_SHOP_TABLES = {
+    "motion.csv": [
+        ("predict", "{}", "--calibration", "cal.json"),
+        ("validate", "model.json", "{}", *_RECORD),
+        ("identify", "{}", *_RECORD, "--period", "1e-3", "--order", "1", "--out", "new.json"),
+    ],
+    "pitch.csv": [(*_CORRECT, "--geometry", "arm.yaml", "--pitch", "{}")],
+    "log.csv": [("import", "{}", "--map", "map.yaml", "--out", "new.mcap")],
+    "good.csv": [
+        ("export", "{}", "--out", "e.ply"),
+        ("form", "{}", *_ON_SURFACE, "--out", "out", "--fit", "piston,tip,tilt"),
+        ("difference", "good.csv", "{}", "--out", "out"),
+    ],
+    "good.xyz": [("export", "{}", "--unit", "mm", "--out", "e.csv")],
+}
+
+
+def through_shop_tables(place: Path, blocks: Any) -> Cases:
+    """Tables and texts of points as other programs and careless hands write them."""
+
+    def of(name: str) -> Cases:
+        mark = None if name.endswith("xyz") else ","
+        good = (place / name).read_bytes()
+        return _with(_SHOP_TABLES[name], _named("bad.csv", shop.texts(good, mark)))
+
+    return st.sampled_from(sorted(_SHOP_TABLES)).flatmap(of)
+
+
 _ON_MAPS = [
     ("export", "{}", "--unit", "mm", "--out", "e.xyz"),
     ("export", "{}", "--unit", "mm", "--out", "e.x3p"),
@@ -236,6 +265,19 @@ def through_messages(place: Path, blocks: Any) -> Cases:
     )
 
 
+def through_streams(place: Path, blocks: Any) -> Cases:
+    """Bags that are wrong from end to end."""
+    return st.builds(
+        lambda words, how: (
+            lambda: Case(
+                (*(w.replace("{}", bag_inputs.write_bag(place, how)) for w in words), "--json")
+            )
+        ),
+        st.sampled_from(_ON_BAGS),
+        shop.streams(blocks),
+    )
+
+
 def through_bag_files(place: Path, blocks: Any) -> Cases:
     names = st.sampled_from(["bad.mcap"] * 6 + ["bad.db3", "bad.bin"])
     raw = bag_inputs.damaged_files((place / "scan.mcap").read_bytes())
@@ -279,10 +321,12 @@ DOORS: dict[Strategy, int] = {
     through_settings: 1,
     through_csv: 1,
     through_tables: 2,
+    through_shop_tables: 3,
     through_maps: 6,
     through_results: 3,
     through_catalogues: 1,
     through_messages: 4,
+    through_streams: 3,
     through_bag_files: 3,
 }
 """Doors, and the share of the cases that each is given."""

@@ -68,6 +68,9 @@ def place(tmp_path_factory, small_scan_blocks, step_test, true_calibration) -> P
     (folder / "motion.csv").write_text(
         "\n".join(["time_s,z_m", *(f"{k / 1000},{k % 100 * 1e-7}" for k in range(600))])
     )
+    (folder / "pitch.csv").write_text(
+        "\n".join(["z_m,pitch_rad", *(f"{k * 1e-5},{k % 7 * 1e-7}" for k in range(-99, 99))])
+    )
     made = calibration_set("x", [(x, true_calibration) for x in (0.0, 2e-3)])
     save_calibration(folder / "set.json", made)
     for name, content in (

@@ -104,13 +104,9 @@ def identify(
     be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
     mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
-
-    def choose(prepared: Prepared) -> tuple[Prepared, Model]:
-        prepared, model = model_from_start(prepared, order)
-        check_gain(model.chosen.fit.gain, slack=_STILL_THE_SAME_SIGNAL)
-        return prepared, model
-
-    searched = search(prepare(record, input), choose, may_grow=not order)
+    searched = search(
+        prepare(record, input), lambda prepared: _chosen(prepared, order), may_grow=not order
+    )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
     drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]
@@ -134,6 +130,12 @@ def identify(
         certificate=origin | certificate_of(evidence, findings, mass),
     )
     return Identification(calibration, prepared, best)
+
+
+def _chosen(prepared: Prepared, order: int) -> tuple[Prepared, Model]:
+    prepared, model = model_from_start(prepared, order)
+    check_gain(model.chosen.fit.gain, slack=_STILL_THE_SAME_SIGNAL)
+    return prepared, model
 
 
 def _findings(evidence: Evidence) -> list[Finding]:

@@ -72,8 +72,12 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
     """Return the lines before the first line of numbers, and that line."""
     header: list[str] = []
-    for raw in islice(iter(lambda: stream.readline(_LONGEST_LINE), b""), _LONGEST_HEADER):
-        line = _decoded(raw).strip()
+    # Old Macs end lines with CR alone, which bytes do not know; detached, it leaves stream open.
+    text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="surrogateescape")
+    lines = [*islice(iter(lambda: text.readline(_LONGEST_LINE), ""), _LONGEST_HEADER)]
+    text.detach()
+    for raw in lines:
+        line = _decoded(raw.encode("utf-8", "surrogateescape")).strip()
         if line and not line.startswith(_COMMENTS) and _all_numbers(line):
             return header, line
         header.append(line)
@@ -85,7 +89,7 @@ def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
 
 def _decoded(raw: bytes) -> str:
     try:
-        return raw.decode("utf-8-sig")  # some programs begin with a mark
+        return raw.decode("utf-8")
     except UnicodeDecodeError:  # a µ as Windows writes it
         return raw.decode("latin-1")
 

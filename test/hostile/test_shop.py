@@ -1,0 +1,60 @@
+"""A table that a shop changed is read as what it is, or refused; never as something else."""
+
+import json
+
+import numpy as np
+import pytest
+from hostile import shop
+
+from omsm_ros import cli
+from omsm_ros.storage.calibration_file import save_calibration
+
+TIME = np.arange(300) * 1e-3
+ROWS = [["time_s", "z_m"], *([f"{t:.3f}", f"{1e-5 * np.sin(30 * t):.9f}"] for t in TIME)]
+POINTS = [["x_m", "y_m", "height_m"]] + [
+    [f"{x * 1e-4:.6f}", f"{y * 1e-4:.6f}", f"{x * y * 1e-8:.10f}"]
+    for x in range(15) for y in range(15)
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory, true_calibration):
+    path = tmp_path_factory.mktemp("calibration") / "cal.json"
+    save_calibration(path, true_calibration)
+    return path
+
+
+def predicted(folder, text, calibration, capsys):
+    (folder / "t.csv").write_bytes(text)
+    words = ["predict", str(folder / "t.csv"), "--calibration", str(calibration), "--json"]
+    status = cli.main(words)
+    said = capsys.readouterr()
+    return status, json.loads(said.out) if status == 0 else said.err
+
+
+def exported(folder, text, capsys):
+    (folder / "t.csv").write_bytes(text)
+    out = folder / "out.xyz"
+    status = cli.main(["export", str(folder / "t.csv"), "--out", str(out), "--json"])
+    err = capsys.readouterr().err
+    return status, np.loadtxt(out)[:, :3] if status == 0 else err
+
+
+@pytest.mark.parametrize("way", shop.HARMLESS)
+def test_what_is_harmless_changes_no_answer(way, tmp_path, calibration, capsys):
+    right = predicted(tmp_path, shop.written(ROWS), calibration, capsys)
+    assert predicted(tmp_path, shop.HARMLESS[way](ROWS), calibration, capsys) == right
+    truth = np.array(POINTS[1:], float)
+    status, found = exported(tmp_path, shop.HARMLESS[way](POINTS), capsys)
+    assert status == 0, found
+    assert found == pytest.approx(truth, rel=1e-8)
+
+
+@pytest.mark.parametrize("way", shop.HARMFUL)
+def test_what_is_another_table_is_refused(way, tmp_path, calibration, capsys):
+    for status, said in (
+        predicted(tmp_path, shop.HARMFUL[way](ROWS), calibration, capsys),
+        exported(tmp_path, shop.HARMFUL[way](POINTS), capsys),
+    ):
+        assert (status, said.count("\n")) == (2, 1), said
+        assert "; " in said, said
