@@ -31,6 +31,7 @@ from omsm_ros.quantities import SAMPLE_PERIOD
 
 # Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
 MAX_RECORD_SAMPLES = 20_000_000
+_LONG = f"more than {MAX_RECORD_SAMPLES} on one grid; check both sample periods"
 
 B = TypeVar("B", bound=Block)
 Values: TypeAlias = Callable[[Any], "tuple[FloatArray, BoolArray]"]
@@ -120,10 +121,8 @@ def assemble(
     counters of axes and distance slipped against each other.
     """
     if not axes or not distance:
-        raise DataError(
-            f"{len(axes)} axis blocks and {len(distance)} distance blocks: "
-            "both are needed; check that both topics were recorded"
-        )
+        counts = f"{len(axes)} axis blocks and {len(distance)} distance blocks"
+        raise DataError(f"{counts}: both are needed; check that both topics were recorded")
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
     if abs(probe_period / period - 1) < SAME_PERIOD and not by_stamps:
@@ -273,12 +272,8 @@ def _by_stamp(
     """Join by counter, once the axis is where a trigger of the grid would have latched it."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
     finer = max(int(np.ceil(probe_period / axis_period - SAME_PERIOD)), 1)
-    if (samples := finer * sum(len(block) for block in distance)) > MAX_RECORD_SAMPLES:
-        raise DataError(
-            f"{len(distance)} distance blocks every {probe_period:g} s on the grid of axes every "
-            f"{axis_period:g} s are {samples} samples, expected at most {MAX_RECORD_SAMPLES}: "
-            "check both sample periods, or cut the recording"
-        )
+    if finer * sum(map(len, distance)) > MAX_RECORD_SAMPLES:
+        raise DataError(f"readings every {probe_period:g} s, axes every {axis_period:g} s: {_LONG}")
     grid = [_refined(block, finer) for block in _ordered(distance)]
     moved = axes_at_probe(_ordered(axes), grid)
     second = []
