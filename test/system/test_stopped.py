@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -39,16 +40,18 @@ def test_nodes_do_not_hear_through_shared_memory_unless_told(cell, monkeypatch):
     assert queues_in_shared_memory(cell.processes.pid("confocal_driver"))
 
 
-@pytest.fixture
+@contextmanager
 def busy():
     """A loop for each processor."""
     loops = [multiprocessing.Process(target=_turn, daemon=True) for _ in range(os.cpu_count())]
     for loop in loops:
         loop.start()
-    yield
-    for loop in loops:
-        loop.kill()
-        loop.join()
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.join()
 
 
 def _turn():
@@ -58,7 +61,7 @@ def _turn():
 
 @pytest.mark.soak
 @pytest.mark.timeout(0)
-def test_clouds_come_as_late_as_a_node_was_stopped(cell, true_calibration, busy):
+def test_clouds_come_as_late_as_a_node_was_stopped(cell, true_calibration):
     radius = 9e-3
     minutes = STOPS * (STOP_S + PAUSE_S) / 60
     cell.start_correcting(
@@ -72,12 +75,13 @@ def test_clouds_come_as_late_as_a_node_was_stopped(cell, true_calibration, busy)
     cell.wait("the recorder", lambda: cell.operator.text("recorder", "lifecycle") == "active")
     assert cell.call(Trigger, "cell_emulator/scan").success
     nodes = itertools.cycle(("recorder", "corrector", "recorder", "confocal_driver"))
-    for node in itertools.islice(nodes, STOPS):
+    with busy():
+        for node in itertools.islice(nodes, STOPS):
+            let_pass(cell, PAUSE_S)
+            os.kill(cell.processes.pid(node), signal.SIGSTOP)
+            let_pass(cell, STOP_S)
+            os.kill(cell.processes.pid(node), signal.SIGCONT)
         let_pass(cell, PAUSE_S)
-        os.kill(cell.processes.pid(node), signal.SIGSTOP)
-        let_pass(cell, STOP_S)
-        os.kill(cell.processes.pid(node), signal.SIGCONT)
-    let_pass(cell, PAUSE_S)
     cell.processes.end("recorder")
     delay = longest_delay_s(bag)
     print(f"{STOPS} stops of {STOP_S} s: clouds came after at most {delay:.1f} s")
