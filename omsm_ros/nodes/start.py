@@ -27,6 +27,8 @@ LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # is read too, where it exists
 _TRANSPORTS_CHOSEN = (_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
+_MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # memory and mode, and not by the next
+_PUBLICATION_MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 _BAD_INPUT = 2
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OTHER_NAMES = {"replay": "player"}
@@ -47,8 +49,7 @@ def main() -> None:
     with nothing_to_undo(ENDING):
         end_with_launch()
         share_one_pool()
-        send_aside()
-        hear_by_udp()
+        set_up_fast_dds()
         for package, remedy in _NEEDED.items():
             try:
                 importlib.import_module(package)
@@ -75,26 +76,32 @@ def end_with_launch() -> None:
         sys.exit(f"the launch that started this node ({launch}) has ended")
 
 
-def send_aside() -> None:
+def set_up_fast_dds() -> None:
+    """Let Fast DDS take what our profile (``fast_dds.xml``) says, unless the user has chosen.
+
+    Messages come by UDP. A listener that stands still for a second or two has its queue in shared
+    memory replaced, and what waited there keeps its places in the sender's memory, which soon has
+    room in small pieces alone. What was missed is sent again in large ones: each fails without a
+    word, again and again, until something else frees that memory.
+
+    The memory of a message is freed when all have it. In the pool that is the default, each place
+    stays as large as the largest message that it ever held, and the longest wait adds places.
+    """
+    chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
+    if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
+        os.environ[_PROFILES] = str(Path(__file__).with_name("fast_dds.xml"))
+        if not os.environ.get(_PUBLICATION_MODE):
+            os.environ.setdefault(_MORE_FROM_PROFILE, "1")
+    _send_aside()
+
+
+def _send_aside() -> None:
     """Let Fast DDS send from a thread of its own: a listener that stands still stops nobody.
 
     Whoever publishes would wait for it, a second and more; after 0.1 s Fast DDS forgets to send the
     message at all, and what follows it reaches that listener only when the queue has run over.
     """
-    os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "ASYNCHRONOUS")
-
-
-def hear_by_udp() -> None:
-    """Let Fast DDS bring messages by UDP, not through shared memory, unless the user has chosen.
-
-    A listener that stands still for a second or two has its queue in shared memory replaced, and
-    what waited there holds its places in the sender's memory, which soon has room in small pieces
-    alone. What was missed is sent again in large ones: each fails without a word, again and again,
-    and the listener hears nothing more of that sender until something else frees the memory.
-    """
-    chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
-    if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
-        os.environ[_PROFILES] = str(Path(__file__).with_name("fast_dds.xml"))
+    os.environ.setdefault(_PUBLICATION_MODE, "ASYNCHRONOUS")
 
 
 if __name__ == "__main__":
