@@ -73,7 +73,7 @@ def test_what_a_command_reads_at_run_time_is_in_it(wheel):
         names = set(archive.namelist())
     tracked = {
         path.relative_to(ROOT).as_posix()
-        for kind in ("html", "css", "js", "json", "yaml", "py")
+        for kind in ("html", "css", "js", "json", "yaml", "xml", "py")
         for path in (ROOT / "omsm_ros").rglob(f"*.{kind}")
         if "interfaces" not in path.parts
     }

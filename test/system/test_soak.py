@@ -32,7 +32,7 @@ DEVICE_PORT = 17_000 + os.getpid() % 1000
 NODES = ("confocal_driver", "corrector", "calibrator", "recorder")
 MOST_GROWTH = 0.01
 LONGEST_FAULT_S = 3.0
-LONGEST_DELAY_S = 20.0  # of a listener that was stopped, and is sent again what it missed
+LONGEST_DELAY_S = 8.0  # of a listener that was stopped, and asks again each 3 s for what it missed
 READING_PERIOD_S = 5.0
 
 
