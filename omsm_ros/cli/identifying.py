@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 from omsm_ros import quantities
@@ -31,11 +32,12 @@ from omsm_ros.jobs.identify_table import (
     record_of_motion,
     record_of_table,
     run_of,
-    save_run,
+    text_of_run,
 )
 from omsm_ros.jobs.remember import remembered
 from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.files import whole_file
 from omsm_ros.storage.model_file import load_model, save_model
 
 TABLE_SUFFIX = ".csv"
@@ -254,11 +256,13 @@ def _validate(args: argparse.Namespace) -> Facts:
         "residual_rms": run.rms,
         "samples": len(record.input),
     }
-    if args.out is not None:
-        save_run(args.out, record, run)
-        facts["run"] = str(args.out)
-    if args.report is not None:
-        facts["report"] = _drawn(args.report, model, record, args.record)
+    with ExitStack() as both:  # neither stands where the other cannot be written
+        if args.out is not None:
+            stream = both.enter_context(whole_file(args.out, "w"))
+            stream.write(text_of_run(record, run))
+            facts["run"] = str(args.out)
+        if args.report is not None:
+            facts["report"] = _drawn(args.report, model, record, args.record)
     return facts
 
 

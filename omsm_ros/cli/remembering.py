@@ -12,6 +12,7 @@ from omsm_ros.cli.command import Command, Facts
 from omsm_ros.cli.printing import say, table, written
 from omsm_ros.core.verification.trend import Trend
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import shown
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.storage.strict_json import unknown_as_null
 from omsm_ros.units import DAY_S
@@ -42,6 +43,10 @@ def _history(args: argparse.Namespace) -> Facts:
         raise ConfigurationError(
             f"no catalogue is named, and there is no {_USUAL!r} here; give --catalogue, set "
             "OMSM_CATALOGUE, or begin one with --add"
+        )
+    if not args.add and "://" not in address and not Path(address).exists():
+        raise ConfigurationError(
+            f"no catalogue at {shown(address)}; check the path, or begin one with --add"
         )
     added = sum(keep(address, path) for path in args.add)
     found = history(address, args.machine)

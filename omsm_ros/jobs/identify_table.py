@@ -12,7 +12,6 @@ from omsm_ros.core.sampled.identify_samples import identify_samples
 from omsm_ros.core.sampled.model import SampledModel
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.storage.files import save_text
 from omsm_ros.storage.table_file import load_columns
 
 
@@ -61,9 +60,9 @@ def run_of(model: SampledModel, record: SampledRecord) -> FreeRun:
     return free_run(model, record.input, record.output, record.used)
 
 
-def save_run(path: Path, record: SampledRecord, run: FreeRun) -> None:
-    """Write time, input, output and the model's output as CSV."""
+def text_of_run(record: SampledRecord, run: FreeRun) -> str:
+    """Return time, input, output and the model's output as CSV."""
     time = record.period * np.arange(len(record.input))
     rows = np.column_stack([time, record.input, record.output, run.output])
     lines = [",".join(f"{value:.12g}" for value in row) for row in rows.tolist()]
-    save_text(path, "\n".join(["time_s,input,output,model", *lines]) + "\n")
+    return "\n".join(["time_s,input,output,model", *lines]) + "\n"

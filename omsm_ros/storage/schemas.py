@@ -52,6 +52,12 @@ _KINDS = {
 }  # fmt: skip
 
 
+def as_number(value: object) -> str:
+    """Return how to write a number in the place of ``value``, if that is a text; else nothing."""
+    text = isinstance(value, str)
+    return "; write digits with a decimal point, without unit and quotes" if text else ""
+
+
 def _said(found: jsonschema.ValidationError) -> str:
     place = found.json_path.removeprefix("$").removeprefix(".")
     said = f"{place} is {shown(found.instance)}" if place else ""
@@ -66,7 +72,8 @@ def _said(found: jsonschema.ValidationError) -> str:
             return f"{missing[0]} is required and missing; write it there"
         case "type":
             kinds = [wanted] if isinstance(wanted, str) else wanted
-            return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}"  # type: ignore[union-attr]
+            hint = as_number(found.instance) if "number" in kinds else ""  # type: ignore[operator]
+            return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}{hint}"  # type: ignore[union-attr]
         case "minimum" | "maximum":
             low, high = (found.schema.get(name) for name in ("minimum", "maximum"))  # type: ignore[union-attr]
             if low is None or high is None:

@@ -21,7 +21,7 @@ from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceErr
 from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text
-from omsm_ros.storage.schemas import NUMBER, check_form, form
+from omsm_ros.storage.schemas import NUMBER, as_number, check_form, form
 
 MAX_YAML_BYTES = 100_000
 # Every shape is evaluated at every point; what is in a turned frame, by Newton's method, some five
@@ -129,7 +129,7 @@ def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
         return tuple(_value(each, v, f"{what}[{k}]", folder) for k, v in enumerate(value))
     if kind is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise SurfaceError(f"{what} is {shown(value)}, expected a number")
+            raise SurfaceError(f"{what} is {shown(value)}, expected a number{as_number(value)}")
         return float(value)
     if kind is Surface or is_dataclass(kind):
         if not isinstance(value, dict):

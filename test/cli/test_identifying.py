@@ -190,3 +190,15 @@ def test_what_becomes_a_bag_by_import_alone_says_so(capsys, table, tmp_path):
         said = capsys.readouterr().err
         assert kind in said
         assert "omsm import" in said
+
+
+def test_validate_writes_no_run_where_the_page_cannot_be(capsys, table, tmp_path):
+    model, out, page = (tmp_path / name for name in ("model.json", "run.csv", "page"))
+    assert run(capsys, table, *COLUMNS, "--hold", "zero-order", "--out", model)[0] == 0
+    page.write_text("a file")
+    words = ["validate", str(model), str(table), *map(str, COLUMNS[:4]), "--out", str(out)]
+    assert cli.main([*words, "--report", str(page)]) == 2
+    assert "give a folder" in capsys.readouterr().err
+    assert not out.exists()
+    assert cli.main(words) == 0
+    assert out.read_text().startswith("time_s,input,output,model")

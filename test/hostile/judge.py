@@ -31,7 +31,7 @@ REMEDIES = (
     "set the", "needs", "must", "state ", "thin it", "save it", "name the", "name it", "name each",
     "measure", "hold what",
     "widen", "split it", "calibrate every", "end it in", "again",
-    "correct the scan", "import the parts",
+    "correct the scan", "import the parts", "sort them",
 )  # fmt: skip
 
 

@@ -25,6 +25,11 @@ def _comma(rows: Rows) -> Rows:
     return [rows[0], *([cell.replace(".", ",") for cell in row] for row in rows[1:])]
 
 
+def _with_line(rows: Rows, line: list[str]) -> Rows:
+    middle = (len(rows) + 1) // 2
+    return [*rows[:middle], line, *rows[middle:]]
+
+
 def _with_column(rows: Rows, name: str, place: int) -> Rows:
     body = enumerate(rows[1:])
     columns = [(rows[0], name), *((row, str(number)) for number, row in body)]
@@ -53,11 +58,11 @@ HARMFUL: dict[str, Text] = {
     "no names": lambda rows: written(rows[1:]),
     "a name twice": lambda rows: written([[*row, row[0]] for row in rows]),
     "a column less": lambda rows: written([row[1:] for row in rows]),
-    "a line short": lambda rows: written([*rows[:40], rows[40][:-1], *rows[41:]]),
-    "a line long": lambda rows: written([*rows[:40], [*rows[40], "1"], *rows[41:]]),
+    "a line short": lambda rows: written(_with_line(rows, rows[-1][:-1])),
+    "a line long": lambda rows: written(_with_line(rows, [*rows[-1], "1"])),
     "names of another unit": lambda rows: written([[f"{n}_furlong" for n in rows[0]], *rows[1:]]),
-    "a line of marks": lambda rows: written([*rows[:40], ["---"] * len(rows[0]), *rows[40:]]),
-    "averages at the end": lambda rows: written([*rows, ["mean", *rows[1][1:]]]),
+    "a line of marks": lambda rows: written(_with_line(rows, ["---"] * len(rows[0]))),
+    "averages at the end": lambda rows: written([*rows, ["mean", *rows[-1][1:]]]),
     "names once more": lambda rows: written([*rows, *rows]),
     "cut short": lambda rows: written([*rows[:-1], [""] * len(rows[0])]).rstrip() + b"-",
     "UTF-16": lambda rows: written(rows).decode().encode("utf-16"),

@@ -55,7 +55,10 @@ def test_the_shipped_file_says_what_its_comments_say():
     [
         ("prob: {}", "'prob' is unknown"),
         ("probe: {latency: 1e-3}", "'latency' is unknown"),
-        ("probe: {latency_s: late}", "probe.latency_s is 'late', expected a number"),
+        (
+            "probe: {latency_s: '1,5'}",
+            "is '1,5', expected a number; write digits with a decimal point",
+        ),
         ("probe: {latency_s: true}", "probe.latency_s is True, expected a number"),
         ("probe: {averages: 1.5}", "probe.averages is 1.5, expected a"),
         ("probe: {latency_s: -1e-3}", "ProbeErrors: latency_s is -0.001"),

@@ -202,7 +202,7 @@ def test_surface_file(tmp_path):
         ("shape: cube\n", "cube"),
         ("shape: [sphere]\n", r"\['sphere'\]"),
         ("shape: sphere\n", "radius is required"),
-        ("{shape: sphere, radius: 100 mm}", "radius is '100 mm', expected a number"),
+        ("{shape: sphere, radius: 100 mm}", "expected a number; write .* without unit"),
         ("{shape: sphere, radius: true}", "radius is True"),
         ("{shape: sphere, radius: 0.0}", "radius is 0.0 m"),
         ("{shape: sphere, radius: 1.0, colour: 2}", "'colour' is unknown"),
