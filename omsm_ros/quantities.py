@@ -122,8 +122,11 @@ def shown(value: object) -> str:
 # Sampled data.
 
 SAMPLE_PERIOD = Quantity("sample period", "s", 1e-7, 10.0, "give it in seconds")
-# Beyond it a float no longer tells neighbours apart; at 1 MHz it lasts 285 years.
-COUNTER = Quantity("trigger counter", "", 0, 2**53, "the device's counter is corrupt", whole=True)
+# From 2**53 on a float no longer tells neighbours apart. A block begins so far below it that all
+# its samples are too; at 1 MHz the counter lasts 285 years.
+COUNTER = Quantity(
+    "trigger counter", "", 0, 2**53 - 2**40, "the device's counter is corrupt", whole=True
+)
 # ROS time has 32 bits of seconds.
 _MAX_STAMP_NS = 2**31 * 10**9
 STAMP = Quantity(

@@ -15,6 +15,7 @@ from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe, fit_clock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.quantities import COUNTER
 from omsm_ros.twin.cell import Cell, Probe, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
@@ -181,3 +182,16 @@ def test_a_scan_with_two_clocks_is_corrected_like_one_with_a_trigger() -> None:
     truth = made.surface_height[every][points.sample - 9]
     assert len(points) > 4900
     assert np.max(abs(points.height - truth)) < 0.1e-9
+
+
+def test_counts_are_told_apart_to_the_highest_that_is_taken() -> None:
+    """Two samples beyond 2**53 had one time."""
+    axes, probe = axis_blocks(), probe_blocks()
+    above = int(COUNTER.high) - axes[-1].first_sample
+    high = axes_at_probe([replace(b, first_sample=b.first_sample + above) for b in axes], probe)
+    _, found = joined(high)
+    _, usual = joined(axes_at_probe(axes, probe))
+    # The middle of so high counts is known to one in 2**53, a count at most.
+    np.testing.assert_allclose(found["z"], usual["z"], atol=0.5e-3 * 2 * np.pi * 6.0 / 4000)
+    with pytest.raises(DataError, match="counter is corrupt"):
+        replace(axes[0], first_sample=2**53)
