@@ -93,8 +93,8 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
         spent = time.monotonic() - start
         node.wait_until(
             "the last block",
-            lambda: node.value("corrector", "axes_received") >= sent,
-            lambda: node.value("corrector", "axes_received"),
+            lambda: _received(node) >= sent,
+            lambda: _received(node),
         )
         used = _processor_time(processes.pid("corrector")) - used
         found = _account(node, sent)
@@ -122,13 +122,17 @@ def _publish(node: Any, publishers: Any, turn: list[Any], rate: float, blocks: i
     return blocks * size
 
 
+def _received(node: Any) -> float:
+    """Return how many samples have come of both streams; of either the other may be on its way."""
+    return min(node.value("corrector", f"{s}_received") for s in ("axes", "distance"))
+
+
 def _account(node: Any, sent: int) -> dict[str, float]:
     """Return what the corrector's diagnostics say of ``sent`` samples."""
-    received = min(node.value("corrector", f"{s}_received") for s in ("axes", "distance"))
     corrected = node.value("corrector", "distance_corrected")
     settling = node.value("corrector", "distance_settling")
     latencies = {key: float(node.text("corrector", key)) for key in ("latency_p99_ms",)}
-    return latencies | {"lost": sent - received, "uncorrected": sent - corrected - settling}
+    return latencies | {"lost": sent - _received(node), "uncorrected": sent - corrected - settling}
 
 
 def _processor_time(pid: int) -> float:
