@@ -131,7 +131,7 @@ def self_calibrate(
     """Return what two or more scans of one part say of the dynamics.
 
     Raises DataError where they say nothing: one speed and direction, a surface
-    without slope along the path, or a part that was re-mounted.
+    without slope along the path, a part that was re-mounted, or no noise at all.
     """
     model = ScanModel(scans, harmonics)
     fit = _Fit(model, prior)
@@ -219,6 +219,11 @@ class _Fit:
         self._matrix = every * equations.matrix / self._variance + self._precision
         parameters = _inverse(self._matrix) @ equations.right * (every / self._variance)
         self._variance = every * equations.misfit(parameters) / len(model)
+        if not self._variance > 0:
+            raise DataError(
+                "the scans show one surface to the last digit, without any noise, so nothing "
+                "tells how sure a lag is; check that the probe was connected and saw the part"
+            )
         self._surface = equations.surface_of(parameters)
         self._equations, self._parameters = equations, parameters
         clocking = [parameters[model.own(k).start + CLOCKING] for k in range(1, model.number)]

@@ -234,3 +234,13 @@ def test_what_is_known_before_is_what_the_covariance_says() -> None:
     assert prior[LAG, LAG] == pytest.approx(STEP_TEST_LAG_U**2)
     assert prior[CURVATURE, CURVATURE] == 0.0
     assert prior[GAIN, GAIN] == 0.0
+
+
+def test_scans_without_any_noise_say_that_nobody_measured() -> None:
+    """A distance that is zero throughout, and a Z that stands: no surface, no scatter."""
+    plain = unit_calibration(1e-3, TRUE_GAIN)
+    pair = [scanned(made(rpm, s, disturbed()), plain) for s, rpm in ((1, 30.0), (2, 60.0))]
+    names = ("height", "motion", "motion_rate", "motion_acceleration")
+    still = [replace(scan, **{n: np.zeros(len(scan)) for n in names}) for scan in pair]
+    with pytest.raises(DataError, match="without any noise"):
+        self_calibrate(still, without_step_test())
