@@ -38,7 +38,10 @@ def staircase(heights, period=1e-3, dwell=0.4, rise=0.02, noise=0.4e-9, seed=0):
 def test_every_step_is_found_whatever_its_size_and_direction(heights, rise, period):
     steps = find_steps(staircase(heights, period, rise=rise), period)
     assert len(steps.edges) == len(heights)
-    np.testing.assert_allclose([e.height for e in steps.edges], heights, atol=0.5e-9)
+    # Rest is to a part of the travel, so a little of the slow end of a long edge counts to it.
+    travel = np.ptp(np.cumsum([0, *heights]))
+    found = [e.height for e in steps.edges]
+    np.testing.assert_allclose(found, heights, atol=max(0.5e-9, 2e-5 * travel))
 
 
 def test_an_edge_covers_the_whole_move():
