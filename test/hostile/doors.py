@@ -254,19 +254,15 @@ _ON_BAGS = [
 
 
 def through_messages(place: Path, blocks: Any) -> Cases:
-    return st.builds(
-        lambda words, how: (
-            lambda: Case(
-                (*(w.replace("{}", bag_inputs.write_bag(place, how)) for w in words), "--json")
-            )
-        ),
-        st.sampled_from(_ON_BAGS),
-        bag_inputs.hostile_bags(blocks),
-    )
+    return _through_bags(place, bag_inputs.hostile_bags(blocks))
 
 
 def through_streams(place: Path, blocks: Any) -> Cases:
     """Bags that are wrong from end to end."""
+    return _through_bags(place, shop.streams(blocks))
+
+
+def _through_bags(place: Path, bags: st.SearchStrategy[Any]) -> Cases:
     return st.builds(
         lambda words, how: (
             lambda: Case(
@@ -274,7 +270,7 @@ def through_streams(place: Path, blocks: Any) -> Cases:
             )
         ),
         st.sampled_from(_ON_BAGS),
-        shop.streams(blocks),
+        bags,
     )
 
 
