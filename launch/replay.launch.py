@@ -22,6 +22,9 @@ ARGUMENTS = {
     "calibration": ("", "calibration file; empty takes the one that the bag holds"),
     "rate": ("1.0", "seconds of the bag a second; 0 = no faster than the corrector takes it"),
     "cell": ("", "namespace of the cell in the bag; empty = the only one"),
+    # Who was there before them may be known to new nodes only when Fast DDS announces him again,
+    # three seconds later; then the two tell each other what they listen to.
+    "delay": ("3.5", "seconds to wait until all who listen are known; 0 = begin at once"),
     "namespace": ("/replay", "where to play it: apart from a live cell"),
 }
 
@@ -56,8 +59,9 @@ def generate_launch_description() -> LaunchDescription:
                 "bag": _text("bag"),
                 "cell": _text("cell"),
                 "wait_for": "corrector",
-                # Of whatever type it is: the player says what is wrong with it.
+                # Of whatever type they are: the player says what is wrong with them.
                 "rate": ParameterValue(LaunchConfiguration("rate")),
+                "delay": ParameterValue(LaunchConfiguration("delay")),
             }
         ],
         output="screen",

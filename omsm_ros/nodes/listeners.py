@@ -63,6 +63,8 @@ class Listeners:
         self._listeners: dict[str, _Listener] = {}
         self._looked = -_LOOK_AROUND_S
         self._seen: Counter[str] = Counter()
+        self._present: dict[str, set[str]] = {}
+        self._changed = time.monotonic()
         self.lost: Counter[str] = Counter()
         self.deaf: set[str] = set()
         undo.callback(self._forget_all)
@@ -82,6 +84,11 @@ class Listeners:
             p.get_subscription_count() > self._seen[p.topic_name] for p in self._publishers
         )
         return not unseen and all(each.taken for each in self._listeners.values())
+
+    @property
+    def unchanged_s(self) -> float:
+        """For how many seconds nobody has come or gone."""
+        return time.monotonic() - self._changed
 
     @property
     def room(self) -> bool:
@@ -130,7 +137,10 @@ class Listeners:
                 self._count_lost(name, each, now)
 
     def _look_around(self, now: float) -> None:
-        present = self._present()
+        before, seen = self._present, self._seen.copy()
+        present = self._present = self._look_who_is_there()
+        if present != before or self._seen != seen:
+            self._changed = now
         for name in self._listeners.keys() - present.keys():
             self._node.destroy_client(self._listeners.pop(name).client)
         for name in present.keys() - self._listeners.keys() - self.deaf:
@@ -139,7 +149,7 @@ class Listeners:
         for name, each in self._listeners.items():
             each.topics = present[name]
 
-    def _present(self) -> dict[str, set[str]]:
+    def _look_who_is_there(self) -> dict[str, set[str]]:
         found: dict[str, set[str]] = {}
         for publisher in self._publishers:
             topic = publisher.topic_name

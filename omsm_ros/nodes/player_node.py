@@ -44,6 +44,7 @@ PARAMETERS = (
     Parameter("listeners", 1, "begin when so many nodes listen to each of axes and confocal",
               quantities.LISTENERS),
     Parameter("wait_for", "", "nodes that have to be among them, e.g. 'corrector viewer'"),
+    Parameter("delay", 0.0, "begin so long after the last of them came", quantities.PLAY_TIME),
 )  # fmt: skip
 RECORDED_POINTS = "recorded/points"
 """Where recorded points go if they are asked for: never among those that are corrected now."""
@@ -178,7 +179,11 @@ class PlayerNode(ManagedNode):
                 return f"nobody listens to {name} yet (parameter listeners)"
             if topic in _NEEDED and (missing := self._missing(name)):
                 return f"{' and '.join(missing)} must listen to {name} first (parameter wait_for)"
-        return "" if self._listeners.known else "who listens has not answered yet"
+        if not self._listeners.known:
+            return "who listens has not answered yet"
+        if self._listeners.unchanged_s < (delay := self.values["delay"]):
+            return f"it begins {delay:g} s after the last listener came (parameter delay)"
+        return ""
 
     def _missing(self, name: str) -> list[str]:
         """Who has to listen to the topic and does not: a recorder alone is no reason to begin."""

@@ -84,6 +84,11 @@ def set_up_fast_dds() -> None:
     room in small pieces alone. What was missed is sent again in large ones: each fails without a
     word, again and again, until something else frees that memory.
 
+    Its first word to the processes that are there is sent from a thread, too, which Fast DDS 2.14
+    does only under a limit to the bytes of a second. Otherwise their answers come before it listens
+    to them, are lost, and who was there is known only when he announces himself anew, up to three
+    seconds later.
+
     The memory of a message is freed when all have it. In the pool that is the default, each place
     stays as large as the largest message that it ever held, and the longest wait adds places.
     """

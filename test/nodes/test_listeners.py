@@ -58,9 +58,10 @@ class Node:
     def __init__(self):
         self.client, self.said, self.told = Client(), [], True
         self.taken = 0
+        self.there = [Endpoint()]
 
     def get_subscriptions_info_by_topic(self, _):
-        return [Endpoint()] if self.told else []
+        return self.there if self.told else []
 
     def create_client(self, *_):
         return self.client
@@ -127,6 +128,20 @@ def test_it_is_waited_for_until_it_has_taken_everything(cell):
     pass_by(1.0)
     assert listeners.waited_for == []
     assert not +listeners.lost
+
+
+def test_it_is_known_for_how_long_nobody_has_come_or_gone(cell):
+    node, listeners, pass_by = cell
+    pass_by(3.0)
+    assert listeners.unchanged_s == pytest.approx(2.9, abs=0.21)  # it is looked around now and then
+    node.there = [Endpoint(), Endpoint()]  # another of the same name
+    pass_by(1.0)
+    assert listeners.unchanged_s == pytest.approx(0.9, abs=0.21)
+    node.there = [Endpoint(), type("Other", (Endpoint,), {"node_name": "other"})()]
+    pass_by(1.0)
+    assert listeners.unchanged_s == pytest.approx(0.9, abs=0.21)
+    pass_by(1.0)
+    assert listeners.unchanged_s == pytest.approx(1.9, abs=0.21)
 
 
 def test_one_of_whom_only_the_middleware_knows_is_not_forgotten(cell):

@@ -43,6 +43,13 @@ def test_fast_dds_is_told_what_to_hear_by_and_to_free():
 
     heard_by = said("participant", "{*}defaultUnicastLocatorList/{*}locator/*")
     assert [each.tag.rpartition("}")[2] for each in heard_by] == ["udpv4"]
+    # Its first word is sent aside only under a limit, whose period is also that of an idle thread.
+    limit = {
+        e.tag.rpartition("}")[2]: int(e.text)
+        for e in said("participant", "{*}throughputController/*")
+    }
+    assert limit["bytesPerPeriod"] / limit["periodMillisecs"] > 1e6  # a gigabyte a second
+    assert limit["periodMillisecs"] >= 1000
     for entity in ("data_writer", "data_reader"):
         assert [each.text for each in said(entity, "{*}historyMemoryPolicy")] == ["DYNAMIC"]
         assert [each.text for each in said(entity, "{*}data_sharing/{*}kind")] == ["OFF"]

@@ -1,6 +1,9 @@
 """A bag played to the nodes gives what the offline command gives at any rate; nothing is lost."""
 
+import os
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -149,6 +152,43 @@ def test_at_rate_0_nothing_is_lost_by_who_stops_for_a_while(
 def numbers_in(path, topic):
     with bags.BagReader(path) as reader:
         return [block.first_sample for _, block in reader.records(topic)]
+
+
+SOMEBODY_ELSE = """
+import sys, threading, rclpy
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+rclpy.init()
+points = []
+node = rclpy.create_node("somebody_else")
+node.create_subscription(
+    PointCloud2, "/omsm/points", lambda cloud: points.append(cloud.width), QoSProfile(depth=2000)
+)
+threading.Thread(target=rclpy.spin, args=[node], daemon=True).start()
+print("listens", flush=True)
+sys.stdin.read()
+print(sum(points), flush=True)
+rclpy.try_shutdown()
+"""
+
+
+def test_somebody_else_who_was_there_before_hears_all(cell, small_scan_blocks, true_calibration):
+    """He has no profile of ours; ``delay`` is that of replay.launch.py."""
+    path = record(cell.folder / "scan.mcap", small_scan_blocks[:BLOCKS], true_calibration)
+    correct_bag(path, true_calibration, cell.folder / "cloud.ply")
+    truth = CloudFile(cell.folder / "cloud.ply").read()
+    plain = {k: v for k, v in os.environ.items() if not k.startswith(("FASTRTPS", "RMW_FASTRTPS"))}
+    with subprocess.Popen(
+        [sys.executable, "-c", SOMEBODY_ELSE],
+        env=plain, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as listener:  # fmt: skip
+        assert listener.stdout.readline() == "listens\n"
+        cell.processes.start("corrector")
+        play(cell, path, rate=0.0, wait_for="corrector", delay=3.5)
+        assert played(cell) == 0
+        time.sleep(0.5)  # on its way through the queue
+        heard, _ = listener.communicate(timeout=10.0)
+    assert int(heard) == len(truth) > 80 * BLOCKS
 
 
 def hear(cell, kind, topic, qos=SAMPLES_QOS):
