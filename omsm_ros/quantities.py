@@ -73,7 +73,10 @@ class Quantity:
         # One fast pass proves most arrays: no element exceeds the root of the sum of squares.
         if self.low == -self.high and float(np.vdot(values, values)) <= self.high * self.high:
             return None
-        good = (values >= self.low) & (values <= self.high)
+        low, high = self.low, self.high
+        if values.dtype.kind == "f":  # else a narrow float would take the bounds into its own range
+            low, high = np.float64(low), np.float64(high)
+        good = (values >= low) & (values <= high)
         return None if np.all(good) else np.asarray(good, np.bool_)
 
     @property
@@ -173,6 +176,8 @@ SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
 PITCH = Quantity("pitch", "rad", -1.0, 1.0, "give it in radians")
 MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
 SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
+# From a tenth of an atom to a metre; places that lie closer are one.
+MAP_SPACING = Quantity("spacing of the map", "m", 1e-12, 1.0, "give it in metres")
 # As many as the largest camera of an interferometer has, 3.4 k × 3.4 k; 0.7 GB while they are read.
 MAP_POINTS = Quantity(
     "number of points", "", 1, 12_000_000, "write their true number, or thin them", whole=True

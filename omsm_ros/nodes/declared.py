@@ -10,8 +10,10 @@ from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
+    ParameterType,
     SetParametersResult,
 )
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -19,6 +21,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.parameters import Parameter
 
 _QOS_PREFIX = "qos_overrides."
+_TYPES = range(ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_STRING_ARRAY + 1)
 
 
 class Declared:
@@ -38,6 +41,9 @@ class Declared:
         for parameter in parameters:
             self._declare(parameter)
         node.add_on_set_parameters_callback(self._on_set)
+        for service in node.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = _of_types_that_are(service.callback)
 
     def _declare(self, parameter: Parameter) -> None:
         value: Any = parameter.default
@@ -92,6 +98,27 @@ class Declared:
         for given in wanted:
             self._wrong.pop(given.name, None)
         return SetParametersResult(successful=True)
+
+
+def _of_types_that_are(
+    set_them: Callable[[Any, Any], Any],
+) -> Callable[[Any, Any], Any]:
+    """Return a callback that refuses a value of no type, which rclpy would leave unanswered."""
+
+    def answer(request: Any, response: Any) -> Any:
+        for given in request.parameters:
+            kind = given.value.type
+            if not _TYPES.start <= kind < _TYPES.stop:
+                reason = f"{given.name!r} has type {kind}, expected 0 to {_TYPES.stop - 1}"
+                refused = SetParametersResult(successful=False, reason=reason)
+                if isinstance(response, SetParametersAtomically.Response):
+                    response.result = refused
+                else:
+                    response.results = [refused] * len(request.parameters)
+                return response
+        return set_them(request, response)
+
+    return answer
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -10,14 +10,16 @@ from binascii import crc32
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from os import SEEK_END
+from os import SEEK_END, fstat
 from pathlib import Path
 from struct import unpack_from
+from types import SimpleNamespace
 from typing import IO
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError, storage_mcap
+from rosbags.rosbag2 import reader as bag_folder
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -30,6 +32,11 @@ MAX_MESSAGE_BYTES = 128 * 1024**2
 # The footer with its places and checksum, and the magic bytes (mcap.dev/spec, "Footer (op=0x02)").
 _RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
 _MAX_METADATA_BYTES = 4 * 1024**2
+# What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
+_MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+# No recording is packed a hundred times; one that is, and is large, was made to fill a disk.
+_MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
 
 
 DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or record it again"
@@ -115,9 +122,31 @@ def _check_checksum(path: Path, stream: IO[bytes]) -> None:
         raise BagError(f"bag {str(path)!r} has an index that does not fit its checksum: {DAMAGED}")
 
 
+def check_unpacked(path: Path, packed: int, unpacked: int) -> None:
+    """Raise BagError if bytes that were ``packed`` unpack to more than those of any recording."""
+    if unpacked > _MOST_PACKED * packed + _ALWAYS_UNPACKED_BYTES:
+        raise BagError(
+            f"bag {str(path)!r} unpacks to {_MOST_PACKED} times its {packed} bytes and more, which "
+            "no recording does; record it again without compression"
+        )
+
+
+def check_length_of_definitions(path: Path) -> None:
+    """Raise BagError for a ROS 2 bag whose definitions of messages take long to take apart."""
+    with Reader(path) as reader:
+        lines = sum(c.msgdef.data.count("\n") for c in reader.connections)
+    if lines > _MOST_DEFINITION_LINES:
+        raise BagError(
+            f"bag {str(path)!r} defines its messages in {lines} lines, at most "
+            f"{_MOST_DEFINITION_LINES} are read; record the topics that are needed alone"
+        )
+
+
 def check_definition(path: Path, connection: Connection, ours: Typestore) -> None:
     """Raise BagError if the bag's definition of a message is not the one that we read it by."""
     expected = ours.hash_rihs01(connection.msgtype)
+    if len(connection.msgdef.data) > _LONGEST_DEFINITION:  # too long to take apart; ours are short
+        connection = connection._replace(msgdef=_NO_DEFINITION, digest="too long to be one")
     found = {connection.digest, _hash_of(connection.msgdef, connection.msgtype)} - {"", expected}
     if found:
         raise BagError(
@@ -167,5 +196,27 @@ def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: 
     return raw
 
 
+class _Unpacked:
+    """A file of a folder that was compressed as a whole, read to a bound."""
+
+    def __init__(self, packed: IO[bytes], mode: str) -> None:
+        self._path, self._size = Path(packed.name), fstat(packed.fileno()).st_size
+        self._stream, self._read = storage_mcap.zstd.open(packed, mode), 0
+
+    def __enter__(self) -> _Unpacked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes; BagError where there are too many."""
+        part: bytes = self._stream.read(size)
+        self._read += len(part)
+        check_unpacked(self._path, self._size, self._read)
+        return part
+
+
 # rosbags unpacks whatever comes out, and looks at its size afterwards.
 storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
+bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)

@@ -1,6 +1,7 @@
-"""Is an HDF5 file read to its end? A damaged one may keep its library in a loop for ever.
+"""Is an HDF5 file read to its end, and from itself alone?
 
-Nothing in this process could interrupt that loop, so another one goes first.
+A damaged one may keep its library in a loop for ever. Nothing in this process could interrupt that
+loop, so another one goes first.
 """
 
 from __future__ import annotations
@@ -11,20 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.errors import FileError
-from omsm_ros.quantities import MAP_POINTS
+from omsm_ros.quantities import MAP_POINTS, shown
 
 # To start a process, and to read from a slow disk; a damaged file of any size is known so soon.
 LIMIT_S, SLOWEST_BYTES_S = 3.0, 50e6
+_ELSEWHERE = 3
 
 
 def walked(path: Path, what: str) -> None:
-    """Raise FileError if reading all of ``path`` does not end in time, or ends its process."""
+    """Raise FileError if reading all of ``path`` does not end, ends its process, or leaves it."""
     command = [sys.executable, "-m", __name__, str(path.absolute())]
     limit = LIMIT_S + path.stat().st_size / SLOWEST_BYTES_S
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=limit)
+        done = subprocess.run(command, capture_output=True, check=False, timeout=limit, text=True)
     except subprocess.TimeoutExpired as err:
         raise FileError(f"{what} is not read in {limit:.1f} s: damaged; write it again") from err
+    if done.returncode == _ELSEWHERE:
+        raise FileError(
+            f"{what} takes {done.stdout.strip()} from another file; save it with all its data"
+        )
     if done.returncode < 0:
         raise FileError(f"{what} ends the program that reads it: damaged; write it again")
 
@@ -33,14 +39,34 @@ def _walk(path: str) -> None:
     """Read every attribute, and every array that could be a map."""
     import h5py
 
-    def look(_: str, item: Any) -> None:
+    def look(name: str, item: Any) -> None:
         list(item.attrs.items())
+        _keep_within(h5py, name, item)
         if isinstance(item, h5py.Dataset) and item.size and item.size <= MAP_POINTS.high:
             item[()]
 
     with h5py.File(path, "r") as content:
-        list(content.attrs.items())
+        look("/", content)
         content.visititems(look)
+
+
+def _keep_within(h5py: Any, name: str, item: Any) -> None:
+    """End this process if an array or a link of a group stands in a file of its own.
+
+    Whoever made the file would choose which one of the reader's is opened, a pipe among them.
+    """
+    if isinstance(item, h5py.Group):
+        links = {child: item.get(child, getlink=True) for child in item}
+        elsewhere = [c for c, link in links.items() if isinstance(link, h5py.ExternalLink)]
+    elif isinstance(item, h5py.Dataset):
+        mapped = item.virtual_sources() if item.is_virtual else []
+        other = item.external or [source for source in mapped if source.file_name != "."]
+        elsewhere = [name] if other else []
+    else:
+        elsewhere = []
+    if elsewhere:
+        print(shown(elsewhere[0]))
+        sys.exit(_ELSEWHERE)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import os
 import struct
 from binascii import crc32
+from time import process_time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omsm_ros.errors import BagError
 from omsm_ros.storage import bag_checks, bags, conversions, message_types
+from omsm_ros.storage.foreign.topic_table import ForeignBag
 from omsm_ros.storage.recording.bag_writer import BagWriter
 
 AXES = bags.TOPIC_TYPES[bags.AXES_TOPIC]
@@ -225,3 +227,34 @@ def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path, message, monke
     folder = foreign_bag(tmp_path / "bag", [message], plugin=StoragePlugin.SQLITE3, mode=mode)
     with pytest.raises(BagError, match="1000 bytes"):
         records(folder)
+
+
+def test_a_file_of_a_folder_that_unpacks_to_gigabytes_is_refused(tmp_path, message):
+    """It would go to the disk, all of it, before anybody looks."""
+    mode = CompressionMode.FILE
+    folder = foreign_bag(tmp_path / "bag", [message], plugin=StoragePlugin.SQLITE3, mode=mode)
+    (packed,) = folder.glob("*.zstd")
+    packed.write_bytes(bag_checks.storage_mcap.zstd.compress(bytes(64 * 1024**2)))
+    with pytest.raises(BagError, match="unpacks to 100 times its"):
+        records(folder)
+    with pytest.raises(BagError, match="unpacks to 100 times its"):
+        ForeignBag(folder)
+
+
+def defined_in(folder, lines):
+    """A bag whose one message is defined in so many lines, most of them remarks."""
+    text = "# a remark\n" * (lines - 1) + "float64 data\n"
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        ours = writer.add_connection(bags.AXES_TOPIC, AXES, msgdef=text, rihs01="RIHS01_")
+        writer.write(ours, 0, bytes(12))
+    return folder / f"{folder.name}.mcap"
+
+
+def test_definitions_that_take_minutes_to_take_apart_are_not(tmp_path):
+    path = defined_in(tmp_path / "long", 300_000)
+    start = process_time()
+    with pytest.raises(BagError, match="defines its messages in 300000 lines"):
+        ForeignBag(path)
+    with pytest.raises(BagError, match="another definition of"):
+        records(path)
+    assert process_time() - start < 1.0

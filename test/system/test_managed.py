@@ -10,7 +10,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from omsm_msgs.srv import LoadCalibration
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.qos import ReliabilityPolicy
 
 from omsm_ros.storage.calibration_file import save_calibration
@@ -39,6 +39,20 @@ def put(cell, node, name, value):
     )
     asked = [Parameter(name=name, value=given)]
     return cell.call(SetParameters, f"{node}/set_parameters", parameters=asked).results[0]
+
+
+def test_a_value_of_a_type_that_there_is_not_is_refused_not_left_without_an_answer(cell):
+    cell.processes.start("calibrator", output=str(cell.folder / "cal.json"), autostart=False)
+    for kind in (10, 255):
+        asked = [Parameter(name="output", value=ParameterValue(type=kind))]
+        several = cell.call(SetParameters, "calibrator/set_parameters", parameters=asked * 2)
+        together = cell.call(
+            SetParametersAtomically, "calibrator/set_parameters_atomically", parameters=asked
+        )
+        for result in (*several.results, together.result):
+            assert not result.successful
+            assert result.reason == f"'output' has type {kind}, expected 0 to 9"
+        assert len(several.results) == 2
 
 
 def test_a_node_is_taken_through_its_stages_and_back(cell):

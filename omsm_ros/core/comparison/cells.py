@@ -10,6 +10,7 @@ import numpy as np
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import MAP_SPACING
 from omsm_ros.readable import quantity
 
 # The orders that are judged; left in, they would bend within a cell.
@@ -87,7 +88,7 @@ def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
     """Return the least side [m] of cells that points (n,) fill, no more than ``most`` across."""
     wide, high = float(np.ptp(x)), float(np.ptp(y))
     extent = max(wide, high)
-    if min(wide, high) <= 0:
+    if min(wide, high) < MAP_SPACING.low:
         raise DataError(
             f"the points cover {quantity(wide, 'm')} × {quantity(high, 'm')}, which is no area; "
             "a profile cannot be made into a map; give points that cover one"

@@ -30,6 +30,11 @@ from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zerni
 from omsm_ros.errors import DataError
 
 HIGHEST_ORDER = 8
+NOT_SETTLED = (
+    "the pose does not settle: on these points it and the part's form look alike; check the "
+    "surface's parameters, the sign of its radii and the units of the cloud, or hold what need not "
+    "be fitted, as --fit piston,tip,tilt"
+)
 _TERMS: tuple[Term, ...] = terms_up_to(HIGHEST_ORDER)
 _SCALE = np.array([1 / rms_of(term) for term in _TERMS])
 # Of its size: a term of which less is new on these points is left out.
@@ -238,7 +243,13 @@ def _inverse(normal: FloatArray, sizes: FloatArray, freedoms: int) -> FloatArray
     index: IntArray = np.arange(freedoms, len(full))
     full[index, index] += 1 / sizes
     root = 1 / np.sqrt(np.diag(full))
-    inverse = np.linalg.inv(full * np.outer(root, root)) * np.outer(root, root)
+    try:
+        inverse = np.linalg.inv(full * np.outer(root, root)) * np.outer(root, root)
+    except np.linalg.LinAlgError as err:
+        raise DataError(NOT_SETTLED) from err
+    # Where pose and form are all but one, rounding leaves variances below zero.
+    if not np.all(np.diag(inverse) > 0):
+        raise DataError(NOT_SETTLED)
     return np.asarray((inverse + inverse.T) / 2, np.float64)
 
 

@@ -21,6 +21,7 @@ from omsm_ros.core.registration.coarse_placement import (
 )
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
+    NOT_SETTLED,
     Estimate,
     FormBasis,
     NormalEquations,
@@ -280,11 +281,7 @@ class _Fit:
                 return _Stand(at, like, limit, found, sums)
             share, last = relaxed(share, last, step), step
             at = at.moved(self.names, share * found.step)
-        raise DataError(
-            "the pose does not settle: on these points it and the part's form look alike; check "
-            "the surface's parameters, the sign of its radii and the units of the cloud, or hold "
-            "what need not be fitted, as --fit piston,tip,tilt"
-        )
+        raise DataError(NOT_SETTLED)
 
 
 def _over_all(

@@ -9,6 +9,7 @@ import numpy as np
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import MAP_SPACING, POSITION
 
 # Coordinates written with five digits lie this much of a spacing beside their place.
 _LARGEST_STRAY = 0.02
@@ -22,7 +23,7 @@ _LEAST_FILLED = 0.2
 class HeightGrid:
     """A map: ``height[row, column]`` [m] at ``x0 + column·dx``, ``y0 + row·dy``; NaN = missing.
 
-    Raises DataError for spacings that are not positive, or a map that is none.
+    Raises DataError for implausible spacings or places, or a map that is none.
     """
 
     height: FloatArray
@@ -35,9 +36,9 @@ class HeightGrid:
         if self.height.ndim != 2 or not self.height.size:
             raise DataError(f"map of shape {self.height.shape!r}, expected rows and columns")
         for name in ("dx", "dy"):
-            spacing = getattr(self, name)
-            if not (np.isfinite(spacing) and spacing > 0):
-                raise DataError(f"spacing {name} of the map is {spacing!r} m, expected above zero")
+            MAP_SPACING.checked(getattr(self, name), DataError, f"spacing {name} of the map")
+        for name in ("x0", "y0"):
+            POSITION.checked(getattr(self, name), DataError, f"{name} of the map")
 
     @property
     def x(self) -> FloatArray:
@@ -75,7 +76,7 @@ def as_grid(points: MeasuredPoints) -> HeightGrid | None:
 def _levels(values: FloatArray) -> tuple[IntArray, float, float] | None:
     """Return the level of each value (n,), the first level and their step; None if uneven."""
     least, span = float(values.min()), float(np.ptp(values))
-    if span <= 0:
+    if span < MAP_SPACING.low:
         return None
     found = np.unique(np.round((values - least) / (span * _LEVEL)))
     steps = np.diff(found)

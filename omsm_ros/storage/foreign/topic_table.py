@@ -25,7 +25,13 @@ from rosbags.typesys.store import Typestore
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import BagError, FileError
-from omsm_ros.storage.bag_checks import check_checksums, check_files, check_index, translated
+from omsm_ros.storage.bag_checks import (
+    check_checksums,
+    check_files,
+    check_index,
+    check_length_of_definitions,
+    translated,
+)
 from omsm_ros.storage.foreign.table import PIECE_ROWS, ForeignTable
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -47,7 +53,10 @@ class ForeignBag:
         self.path = path
         with translated(path, _REMEDY), ExitStack() as opening:
             check_files(path)
-            self.reader = opening.enter_context(AnyReader([path], default_typestore=_standard()))
+            self.reader = AnyReader([path], default_typestore=_standard())
+            if self.reader.is2:
+                check_length_of_definitions(path)
+            opening.enter_context(self.reader)
             if self.reader.is2:
                 for part in self.reader.readers:
                     assert isinstance(part, Reader)

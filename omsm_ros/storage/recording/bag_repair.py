@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from struct import unpack
+from struct import unpack, unpack_from
 from typing import IO
 
 from mcap.data_stream import ReadDataStream
@@ -21,7 +21,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from omsm_ros.errors import BagError
-from omsm_ros.storage.bag_checks import MAX_CHUNK_BYTES, unpacked_chunk
+from omsm_ros.storage.bag_checks import MAX_CHUNK_BYTES, check_unpacked, unpacked_chunk
 from omsm_ros.storage.files import open_regular, said
 from omsm_ros.storage.recording.bag_writer import finish, new_bag_file, new_writer
 
@@ -93,13 +93,14 @@ class _Copy:
         self._path, self._writer, self._made = path, writer, made
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, tuple[int, str]] = {}
+        self._unpacked = 0
 
     def run(self, written: Callable[[], None]) -> None:
         with open_regular(self._path, BagError, "bag") as stream:
             _check_magic(stream, self._path)
             for place, kind, body in self._records(stream):
                 try:
-                    for record in _within(kind, body):
+                    for record in self._within(kind, body):
                         self._add(record)
                 except Exception as err:  # the libraries raise what their parts raise
                     self._lose(f"{len(body)} bytes at {place}: {said(err)}")
@@ -118,6 +119,30 @@ class _Copy:
                 self._lose(f"the last {rest} bytes, at {place}: the file was cut short there")
                 return
             yield place, kind, body
+
+    def _within(self, kind: int, body: bytes) -> list[McapRecord]:
+        """Return the definitions, channels and messages of a record.
+
+        Raises an exception if it is damaged.
+        """
+        stream = ReadDataStream(BytesIO(body))
+        if kind == Opcode.SCHEMA:
+            return [Schema.read(stream)]
+        if kind == Opcode.CHANNEL:
+            return [Channel.read(stream)]
+        if kind == Opcode.MESSAGE:
+            return [Message.read(stream, len(body))]
+        if kind != Opcode.CHUNK:
+            return []
+        chunk = Chunk.read(stream)
+        self._unpacked += chunk.uncompressed_size
+        check_unpacked(self._path, self._path.stat().st_size, self._unpacked)
+        chunk.data = unpacked_chunk(
+            chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
+        )
+        chunk.compression = ""
+        _check_records(chunk.data)
+        return breakup_chunk(chunk)
 
     def _add(self, record: McapRecord) -> None:
         if isinstance(record, Schema) and record.id not in self._schemas:
@@ -146,20 +171,11 @@ class _Copy:
             self._made.lost.append(f"{self._path.name}: {what}")
 
 
-def _within(kind: int, body: bytes) -> list[McapRecord]:
-    """Return the definitions, channels and messages of a record; an exception if it is damaged."""
-    stream = ReadDataStream(BytesIO(body))
-    if kind == Opcode.SCHEMA:
-        return [Schema.read(stream)]
-    if kind == Opcode.CHANNEL:
-        return [Channel.read(stream)]
-    if kind == Opcode.MESSAGE:
-        return [Message.read(stream, len(body))]
-    if kind != Opcode.CHUNK:
-        return []
-    chunk = Chunk.read(stream)
-    chunk.data = unpacked_chunk(
-        chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
-    )
-    chunk.compression = ""
-    return breakup_chunk(chunk)
+def _check_records(data: bytes) -> None:
+    """Raise ValueError for a chunk in which a record is of no kind: a run of zeros, most often."""
+    place = 0
+    while place <= len(data) - _HEAD_BYTES:
+        kind, length = unpack_from("<BQ", data, place)
+        if not kind:
+            raise ValueError(f"a record of no kind at {place} of a chunk")
+        place += _HEAD_BYTES + length

@@ -1,13 +1,20 @@
 """What can be saved of a bag that was cut short or damaged."""
 
 import struct
+from time import process_time
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+    storage_mcap,
+)
 
 from omsm_ros.errors import BagError
-from omsm_ros.storage import bags, conversions, message_types
+from omsm_ros.storage import bag_checks, bags, conversions, message_types
 from omsm_ros.storage.recording.bag_repair import repair
 from omsm_ros.storage.recording.bag_writer import BagWriter
 
@@ -148,3 +155,37 @@ def test_any_damage_is_survived_and_what_is_saved_is_true(whole, small_scan_bloc
                 for _, block in reader.records(bags.AXES_TOPIC):
                     np.testing.assert_array_equal(block.z, truth[block.first_sample])
         made.path.unlink()
+
+
+def chunk_of(data, compress):
+    """An MCAP file of one chunk (mcap.dev/spec, "Chunk (op=0x06)"), many times."""
+    packed = compress(data)
+    body = struct.pack("<QQQII4sQ", 0, 1, len(data), 0, 4, b"zstd", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+def test_chunks_of_zeros_are_lost_at_once(tmp_path):
+    """Each nine of them are a record of no kind: a kilobyte would be a million of them."""
+    path, compress = tmp_path / "zeros.mcap", storage_mcap.zstd.compress
+    path.write_bytes(b"\x89MCAP0\r\n" + chunk_of(bytes(10**6), compress) * 400)
+    start = process_time()
+    made = repair(path)
+    assert process_time() - start < 1.0
+    assert not made.messages
+    assert "a record of no kind at 0" in made.lost[0]
+
+
+def test_chunks_that_unpack_to_more_than_a_recording_are_lost(tmp_path, monkeypatch):
+    """Tiny messages in small files: what is taken apart does not grow beyond a bound."""
+    monkeypatch.setattr(bag_checks, "_ALWAYS_UNPACKED_BYTES", 10**6)
+    path, compress = tmp_path / "tiny.mcap", storage_mcap.zstd.compress
+    schema, channel = struct.pack("<HIII", 1, 0, 0, 0), struct.pack("<HHIII", 1, 1, 0, 0, 0)
+    known = struct.pack("<BQ", 3, 14) + schema + struct.pack("<BQ", 4, 16) + channel
+    tiny = struct.pack("<BQ", 5, 22) + struct.pack("<HIQQ", 1, 0, 0, 0)
+    chunks = (known + tiny * 10, *[tiny * 15_000] * 4)
+    path.write_bytes(b"\x89MCAP0\r\n" + b"".join(chunk_of(c, compress) for c in chunks))
+    within = (10**6 + 100 * path.stat().st_size - len(chunks[0])) // len(chunks[1])
+    assert within < 4
+    made = repair(path)
+    assert made.messages[""] == 10 + 15_000 * within
+    assert sum("unpacks to 100 times its" in what for what in made.lost) == 4 - within

@@ -1,0 +1,127 @@
+"""Maps and clouds whose places no instrument makes, or whose heights stand in another file."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile import maps, trees
+from hostile.judge import Case, ask, judge
+
+EXPORT = ("export", "{}", "--unit", "m", "--out", "e.x3p")
+IMPORT = ("import", "{}", "--map", "map.yaml", "--out", "new.mcap")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("places")
+    maps.write_maps(folder)
+    (folder / "map.yaml").write_text(json.dumps(trees.COLUMNS))
+    (folder / "surface.yaml").write_text("shape: sphere\nradius: -0.1\n")
+    os.mkfifo(folder / "pipe")
+    return folder
+
+
+def refused(place: Path, words: tuple[str, ...], name: str, raw: bytes) -> str:
+    case = Case((*(word.replace("{}", name) for word in words), "--json"), {name: raw})
+    answer = ask(case, place)
+    assert answer.status == 2, answer
+    judge(case, answer, place)
+    return answer.err
+
+
+@pytest.mark.parametrize("size", [5e-324, 1e-320, 1e-200])
+def test_places_that_are_one_but_for_their_last_bits_are_no_area(place, size, recwarn):
+    """Shares of their extent would be divided by zero."""
+    x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))
+    rows = np.c_[x.ravel() * size, y.ravel() * size, np.zeros(100)].tolist()
+    raw = "\n".join(" ".join(map(repr, row)) for row in rows).encode()
+    assert "no area" in refused(place, EXPORT, "tiny.xyz", raw)
+    words = ("form", "{}", "--nominal", "surface.yaml", "--unit", "m", "--out", "out")
+    assert "points lie on the nominal surface" in refused(place, words, "tiny.xyz", raw)
+    assert not list(recwarn)
+
+
+@pytest.mark.parametrize(("entry", "told"), [(2, "dx"), (3, "dy")])
+@pytest.mark.parametrize("value", ["1e308", "1e-320"])
+def test_a_map_of_impossible_spacing_is_refused(place, entry, told, value, recwarn):
+    first, *rest = (place / "good.dat").read_text().split("\n")
+    numbers = first.split()
+    numbers[entry] = value
+    raw = "\n".join([" ".join(numbers), *rest]).encode()
+    words = ("export", "{}", "--out", "e.x3p")
+    assert f"spacing {told} of the map" in refused(place, words, "bad.dat", raw)
+    assert not list(recwarn)
+
+
+def test_heights_that_a_move_explains_as_well_as_any_form_are_told(place, recwarn):
+    """A plane at 45° before a mirror of another shape: pose and form are all but one."""
+    turn, radius = 0.5 * np.arange(20_000), np.linspace(1e-3, 2e-5, 20_000)
+    x, y = radius * np.cos(turn), radius * np.sin(turn)
+    raw = "\n".join(f"{a!r} {b!r} {a!r}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+    (place / "mirror.yaml").write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    words = ("form", "{}", "--nominal", "mirror.yaml", "--unit", "m", "--out", "out")
+    assert "the pose does not settle" in refused(place, words, "plane.xyz", raw.encode())
+    assert not list(recwarn)
+
+
+# HDF5.
+
+
+@pytest.fixture
+def table(place):
+    """Write a table of ours with ``change`` made to it; its bytes."""
+    h5py = pytest.importorskip("h5py", reason="the extra 'formats' is not installed")
+
+    def made(change) -> bytes:
+        with h5py.File(place / "made.h5", "w") as content:
+            content.attrs["schema"] = "omsm-points/1"
+            for name in ("x", "y", "height"):
+                content[name] = np.linspace(0, 1e-3, 400)
+            change(h5py, content)
+        return (place / "made.h5").read_bytes()
+
+    return made
+
+
+def linked(h5py, content):
+    del content["height"]
+    content["height"] = h5py.ExternalLink("good.h5", "height")
+
+
+def stored(file):
+    def change(_, content):
+        del content["height"]
+        content.create_dataset("height", (400,), "f8", external=[(file, 0, 3200)])
+
+    return change
+
+
+def mapped(h5py, content):
+    del content["height"]
+    layout = h5py.VirtualLayout((400,), "f8")
+    layout[:361] = h5py.VirtualSource("good.h5", "height", (361,))
+    content.create_virtual_dataset("height", layout)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(linked, EXPORT), (stored("/dev/zero"), EXPORT), (stored("pipe"), IMPORT), (mapped, IMPORT)],
+)
+def test_numbers_that_stand_in_another_file_are_not_fetched(place, table, change, words):
+    said = refused(place, words, "made.h5", table(change))
+    assert "takes 'height' from another file" in said
+
+
+def test_numbers_of_half_precision_are_held_against_the_same_bounds(place, table, recwarn):
+    def change(_, content):
+        content["sample"] = np.zeros(400, np.float16)
+        content["uncertainty"] = np.full(400, np.inf, np.float16)
+
+    assert "uncertainty[0] is inf m" in refused(place, EXPORT, "made.h5", table(change))
+    assert not list(recwarn)
