@@ -73,6 +73,14 @@ def test_every_value_of_the_yaml_will_do(node):
         parameter.checked(values[parameter.name])
 
 
+@pytest.mark.parametrize("node", NODES)
+def test_a_default_is_still_a_text_when_it_is_read_again(node):
+    """`ros2 param load` reads what `ros2 param dump` wrote, and then each text once more."""
+    for parameter in _parameters(node):
+        if isinstance(parameter.default, str):
+            assert isinstance(yaml.safe_load(parameter.default) or "", str), parameter.name
+
+
 def test_every_node_with_parameters_has_its_yaml():
     nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
     assert {node for node in nodes if list(_declared(node))} == set(NODES)

@@ -48,7 +48,7 @@ PARAMETERS = (
         "output", "calibration.json", "link to the calibration in force; each has a file beside it"
     ),
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
-    Parameter("settings", "{}", "JSON object of what the calibration belongs to"),
+    Parameter("settings", "", "JSON object of what the calibration belongs to"),
     Parameter("catalogue", "", "file or URL of the database to write it down in; empty = none"),
     *TRIGGER,
 )

@@ -51,7 +51,7 @@ PARAMETERS = (
         "started; empty = any folder",
     ),
     Parameter("follow_calibrator", True, "take what appears on the topic calibration"),
-    Parameter("settings", "{}", "JSON object of how the cell is set now; {} = not compared"),
+    Parameter("settings", "", "JSON object of how the cell is set now; empty = not compared"),
     Parameter("override", False, "use a calibration that does not belong; every cloud says so"),
     Parameter("polarity", 1, "+1: distance falls as z rises; -1: reversed", choices=(1, -1)),
     Parameter(

@@ -13,6 +13,8 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -28,7 +30,7 @@ from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
 from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
-from omsm_ros.storage import strict_json
+from omsm_ros.storage import strict_json, strict_yaml
 
 _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
 # A node that has not ended so long after it was asked to ends at the next signal, as it stands.
@@ -72,6 +74,19 @@ def _init() -> None:
         RuntimeError
     ) as err:  # a parameter file that is missing or no YAML, an argument of no kind
         raise ConfigurationError(str(err).split(", at ")[0]) from err
+    for flag, name in pairwise(sys.argv):
+        if flag == "--params-file":
+            _check_parameter_file(Path(name))
+
+
+def _check_parameter_file(path: Path) -> None:
+    """Refuse what rcl passes over: a text that is one single value, or none at all."""
+    # A pipe has been read by now.
+    if path.is_file() and not strict_yaml.begins_as_mapping(path.read_bytes()):
+        raise ConfigurationError(
+            f"{str(path)!r} is no file of parameters: one begins with the name of a node, or "
+            "/**, and has ros__parameters below"
+        )
 
 
 def _give_up(node: ManagedNode | None, err: Exception) -> None:
@@ -145,8 +160,8 @@ def _spin(node: ManagedNode, ending: _Ending) -> None:
 
 
 def settings_of(text: str) -> dict[str, object]:
-    """Return settings from a parameter that holds a JSON object, else ConfigurationError."""
-    return strict_json.object_of(text, ConfigurationError, "parameter 'settings'")
+    """Return settings from a JSON object, or an empty text; else ConfigurationError."""
+    return strict_json.object_of(text or "{}", ConfigurationError, "parameter 'settings'")
 
 
 class Paced(ReentrantCallbackGroup):  # type: ignore[misc]

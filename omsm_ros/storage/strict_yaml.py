@@ -100,6 +100,17 @@ def mapping_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:
     return content
 
 
+def begins_as_mapping(text: bytes) -> bool:
+    """Whether a YAML text of any kind begins with a name and its value; the rest is not read."""
+    begin = yaml.StreamStartEvent, yaml.DocumentStartEvent
+    try:
+        events = yaml.parse(text, yaml.SafeLoader)
+        first = next((event for event in events if not isinstance(event, begin)), None)
+    except yaml.YAMLError:
+        return False
+    return isinstance(first, yaml.MappingStartEvent)
+
+
 def _said(err: Exception) -> str:
     mark = getattr(err, "problem_mark", None)
     place = f"line {mark.line + 1}: " if mark is not None else ""

@@ -66,3 +66,17 @@ def test_a_number_is_finite():
     assert all(
         math.isfinite(value) for value in read("a: 1.7e308\nb: -1.7e308\nc: 5e-324").values()
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "begins"),
+    [
+        (b"/**:\n  ros__parameters:\n    a: 1\n", True), (b"{a: 1}", True),
+        (b"# of the cell\n---\na: &here 1\n", True), (b"a: 1\n b\n- c: [", True),
+        (b"", False), (b"# only\n", False), (b"- a: 1\n", False), (b"3", False),
+        (b"\x00\xff", False),
+        (b"root:x:0:0:root:/root:/bin/sh\ndaemon:x:1:1::/:/bin/sh\n", False), (b"\t[", False),
+    ],
+)  # fmt: skip
+def test_a_text_is_known_by_its_beginning(text, begins):
+    assert strict_yaml.begins_as_mapping(text) is begins

@@ -151,6 +151,7 @@ def start(node, *arguments):
             marks=pytest.mark.soak,
         ),
         ("corrector", ["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
+        ("corrector", ["--params-file", "/etc/passwd"], "'/etc/passwd' is no file of parameters"),
         ("confocal_driver", ["-p", "block_size:=-7", "-p", "port:=/dev/null"], "block_size"),
         ("confocal_driver", ["-p", "port:=/dev/null"], "'x.counts_per_unit' is not stated"),
     ],
