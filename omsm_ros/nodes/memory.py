@@ -6,19 +6,39 @@ Nothing is imported here that takes time: it is needed before the rest loads.
 from __future__ import annotations
 
 import ctypes
+import os
+import signal
+import sys
+from collections.abc import Collection
+from contextlib import suppress
 
 RETURN_PERIOD_S = 10.0
 """Between two times at which a node gives back what it does not need."""
 
 _M_ARENA_MAX = -8  # of <malloc.h>
 _LIBC = ctypes.CDLL(None)
+_SETTINGS, _KEPT_BY_THREADS = "GLIBC_TUNABLES", "glibc.malloc.tcache_count"
 
 
-def share_one_pool() -> None:
-    """Let all threads share one pool of memory; each of the middleware's would keep its own."""
+def share_one_pool(held_back: Collection[signal.Signals] = ()) -> None:
+    """Let all threads share one pool of memory; each of the middleware's would keep its own.
+
+    A thread would also keep small pieces that were freed, seven of each size: what it needed once,
+    in a burst, lies scattered behind that burst for as long as the thread lives, and no page in
+    between goes back. glibc hears of that only where a process begins, so this one begins again,
+    under its number, unless that was set before. Signals ``held_back`` wait until then.
+    """
     mallopt = getattr(_LIBC, "mallopt", None)  # glibc has it
-    if mallopt is not None:
-        mallopt(_M_ARENA_MAX, 1)
+    if mallopt is None:
+        return
+    mallopt(_M_ARENA_MAX, 1)
+    before = os.environ.get(_SETTINGS, "")
+    if _KEPT_BY_THREADS not in before:
+        os.environ[_SETTINGS] = f"{before}:{_KEPT_BY_THREADS}=0".lstrip(":")
+        signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
+        with suppress(OSError):  # then it goes on as it is
+            os.execv(sys.executable, sys.orig_argv)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, held_back)
 
 
 def give_back() -> None:

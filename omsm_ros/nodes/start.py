@@ -47,8 +47,8 @@ def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
     with nothing_to_undo(ENDING):
+        share_one_pool(ENDING)  # first, for the process may begin again
         end_with_launch()
-        share_one_pool()
         set_up_fast_dds()
         for package, remedy in _NEEDED.items():
             try:

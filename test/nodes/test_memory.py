@@ -1,6 +1,9 @@
 """Memory that was freed goes back to the system, also from below what is still in use."""
 
 import ctypes
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,13 +12,58 @@ from omsm_ros.nodes.memory import give_back
 
 PIECE, COUNT = 4000, 4000
 
+# Each thread takes small pieces, seven of each size, far apart, frees all, and lives on.
+BURST = """
+import ctypes, signal, sys, threading
+from omsm_ros.nodes import memory
+from nodes.test_memory import held_kib
+
+if sys.argv[1] == "nodes":
+    memory.share_one_pool([signal.SIGINT])
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+libc.free.argtypes = [ctypes.c_void_p]
+done, end = threading.Barrier(9), threading.Event()
+
+def burst():
+    taken = [libc.malloc(n) for k in range(7) for size in range(16, 1025, 16) for n in (size, 3000)]
+    for place in taken:
+        ctypes.memset(place, 1, 16)
+    for place in taken:
+        libc.free(place)
+    done.wait()
+    end.wait()
+
+before = held_kib()
+for _ in range(8):
+    threading.Thread(target=burst).start()
+done.wait()
+memory.give_back()
+print(held_kib() - before)
+end.set()
+"""
+# Tells what it was begun with; asked to end as it begins again, it ends only where it hears it.
+BEGUN = """
+import os, signal, sys
+from omsm_ros.nodes import memory
+
+again = "tcache" in os.environ.get("GLIBC_TUNABLES", "")
+signal.signal(signal.SIGUSR1, lambda *_: print("heard"))
+if not again:
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
+    os.kill(os.getpid(), signal.SIGUSR1)
+print(os.getpid(), sys.argv[1:], os.environ.get("GLIBC_TUNABLES"), flush=True)
+memory.share_one_pool([signal.SIGUSR1])
+"""
+glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
+
 
 def held_kib():
     (line,) = (t for t in Path("/proc/self/status").read_text().splitlines() if "RssAnon" in t)
     return int(line.split()[1])
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
+@glibc
 def test_what_was_freed_below_a_piece_in_use_is_given_back():
     """As a backlog is freed while younger pieces stay; 16 MB, of which the pool keeps none."""
     libc = ctypes.CDLL(None)
@@ -38,3 +86,40 @@ def test_what_was_freed_below_a_piece_in_use_is_given_back():
     assert full > 0.9 * size
     assert kept > 0.9 * size  # else there would be nothing to mend
     assert left < 0.1 * size
+
+
+def said(program, *arguments, **settings):
+    """Its lines, run as a process whose glibc was told ``settings`` alone."""
+    told = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
+    told["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    command = [sys.executable, "-c", program, *arguments]
+    done = subprocess.run(command, env=told | settings, check=True, stdout=subprocess.PIPE)
+    return done.stdout.decode().splitlines()
+
+
+@glibc
+def test_threads_of_a_node_keep_nothing_of_a_burst():
+    """Eight of them, of some 1.4 MB each; by default the small pieces hold most of it."""
+    (usual,) = said(BURST, "others")
+    assert int(usual) > 6000  # else there would be nothing to mend
+    (kept,) = said(BURST, "nodes")
+    assert int(kept) < 1000
+
+
+@glibc
+def test_a_process_begins_again_once_as_it_was():
+    first, second, heard = said(BEGUN, "a b", "c")
+    number, arguments = first.split(" ", 1)
+    assert arguments == "['a b', 'c'] None"
+    assert second == f"{number} ['a b', 'c'] glibc.malloc.tcache_count=0"
+    assert heard == "heard"
+
+
+@glibc
+def test_what_the_user_told_glibc_stays():
+    other = "glibc.malloc.perturb=0"
+    _, second, _ = said(BEGUN, GLIBC_TUNABLES=other)
+    assert second.endswith(f"{other}:glibc.malloc.tcache_count=0")
+    chosen = "glibc.malloc.tcache_count=3"
+    (only,) = said(BEGUN, GLIBC_TUNABLES=chosen)
+    assert only.endswith(chosen)
