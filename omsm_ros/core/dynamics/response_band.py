@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.units import DEGREE_RAD
 
 # 95 % of a normal distribution.
@@ -111,21 +111,39 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
     return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
 
 
+def shown(
+    centres: FloatArray,
+    frequency: FloatArray,
+    answer: ComplexArray,
+    noise: FloatArray,
+    limits: ResponseLimits,
+) -> BoolArray:
+    """Return whether the data would show a response off by ``limits`` at ``centres`` (c,) [Hz].
+
+    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
+    noise: mean square of the transform of the probe's noise, (k,)
+    Where they would not, a model interpolates or extrapolates, and what it misses there shows in
+    no residual. Taken over a third of an octave: a deviation δ of G adds δ · answer, so its best
+    estimate has the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    """
+    power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
+    edges = np.outer([2 ** (-1 / 6), 2 ** (1 / 6)], centres)
+    first = np.searchsorted(frequency, edges[0])
+    # At low frequency no line may lie within a third of an octave: then the next one.
+    last = np.maximum(np.searchsorted(frequency, edges[1], side="right"), first + 1)
+    near = [slice(*ends) for ends in zip(first, last, strict=True)]
+    energy = np.array([np.sum(power[part]) for part in near])
+    disturbed = np.array([power[part] @ noise[part] for part in near])
+    return np.asarray(energy * allowed > np.sqrt(0.5 * disturbed), np.bool_)
+
+
 def shown_up_to(
     frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
 ) -> float:
     """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
 
-    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
-    noise: mean square of the transform of the probe's noise, (k,)
-    A model extrapolates beyond it, and what it misses there shows in no residual. Taken
-    over a third of an octave: a deviation δ of G adds δ · answer, so its best estimate has
-    the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    Arguments as of :func:`shown`; 0 where they show it nowhere.
     """
-    power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
-    for centre in frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP)):
-        near = np.abs(np.log2(np.maximum(frequency, 1e-3 * centre) / centre)) <= 1 / 6
-        energy = float(np.sum(power[near]))
-        if energy * allowed > np.sqrt(0.5 * float(power[near] @ noise[near])):
-            return float(centre)
-    return 0.0
+    centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
+    found = np.flatnonzero(shown(centres, frequency, answer, noise, limits))
+    return float(centres[found[0]]) if len(found) else 0.0

@@ -16,6 +16,7 @@ from scipy import signal
 
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
+from omsm_ros.core.fitting.excitation import excited_parameters
 from omsm_ros.core.fitting.held_problem import RATE_SAMPLES, DiscreteScaled, HeldProblem
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Fit, fit
@@ -92,14 +93,15 @@ def choose_sampled(
 
     order: number of poles, 0 to choose;  max_delay: whole samples to try
 
-    Raises IdentificationError when too few samples are used for the order asked for, for an
-    order beyond MAX_ORDER, or where a value is not finite.
+    Raises IdentificationError when too few samples are used for the order asked for, or the input
+    has too few frequencies, for an order beyond MAX_ORDER, or where a value is not finite.
     """
     most = _highest_order(int(np.sum(used)), order)
     if np.ptp(input) == 0:
         raise IdentificationError("the input never changes; excite it while recording")
     if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
         raise IdentificationError("a value of input or output is not finite where it is used")
+    most = _most_excited(input, most, order)
     centred = np.where(used, output - np.mean(output[used]), 0.0)
     delay = _best_delay(input, centred, used, period, max_delay)
     problem = _delayed(input, centred, used, period, delay)
@@ -152,6 +154,18 @@ def _highest_order(samples: int, order: int) -> int:
             f"{max(order, 1)}; record more, or ask for a lower order"
         )
     return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
+
+
+def _most_excited(input: FloatArray, most: int, order: int) -> int:
+    """Return the highest order, at most ``most``, whose numerator and denominator show."""
+    excited = excited_parameters(input, min(2 * most + 1, len(input)))
+    if excited < 2 * max(order, 1) + 1:
+        raise IdentificationError(
+            f"the input excites {excited!r} parameters only, {2 * max(order, 1) + 1!r} are needed "
+            f"for order {max(order, 1)}: each of its frequencies tells a gain and a phase; record "
+            "with steps, noise, or more frequencies at once"
+        )
+    return min(most, (excited - 1) // 2)
 
 
 def _parts(used: BoolArray) -> FloatArray:

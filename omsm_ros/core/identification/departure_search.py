@@ -35,6 +35,9 @@ from omsm_ros.core.identification.model_choice import Model
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
+# Poles of all fits, after which no round begins. Of 450 disturbed step tests those accepted in the
+# end had at most 82 before their last round; what is not linear asks for ever more.
+_MOST_POLES = 120
 _BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Their columns follow the fitted response, which they improve.
 _TURNING = {BACKLASH, FRICTION}
@@ -90,13 +93,9 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
 
     choose: fits a prepared problem anew;  may_grow: poles may be added to the model
     """
-    prepared, beside = _with_columns(prepared, _drift(prepared))
-    prepared, model = choose(prepared)
-    columns = _imitated(prepared, model)
-    if columns:
-        prepared, added = _with_columns(prepared, columns, beside)
-        beside += added
-        prepared, model = choose(prepared)
+    fitted: list[Candidate] = []
+    choose = _keeping(choose, fitted)
+    prepared, beside, model = _first(prepared, choose)
     grown: list[Term] = []
     without: list[Survey] = []
     settled: set[str] = set()
@@ -105,7 +104,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
     survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
         shown = _but_lines(survey.significant(refused | settled), modes)
-        if not shown:
+        if not shown or sum(c.fit.structure.poles for c in fitted) > _MOST_POLES:
             break
         columns = _beside(survey, shown)
         again = {c.term.family for c in columns} & _TURNING & {b.term.family for b in beside}
@@ -129,6 +128,29 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
             without.append(survey)
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     return Searched(prepared, model, survey, beside, grown, survey.significant(settled), without)
+
+
+def _keeping(choose: Choose, fitted: list[Candidate]) -> Choose:
+    """Return ``choose`` that adds to ``fitted`` what it tried."""
+
+    def kept(prepared: Prepared) -> tuple[Prepared, Model]:
+        prepared, model = choose(prepared)
+        fitted.extend(model.candidates)
+        return prepared, model
+
+    return kept
+
+
+def _first(prepared: Prepared, choose: Choose) -> tuple[Prepared, list[ModelledTerm], Model]:
+    """Return the problem and its model, beside what shows first or what its poles imitate."""
+    prepared, beside = _with_columns(prepared, _drift(prepared))
+    prepared, model = choose(prepared)
+    columns = _imitated(prepared, model)
+    if columns:
+        prepared, added = _with_columns(prepared, columns, beside)
+        beside += added
+        prepared, model = choose(prepared)
+    return prepared, beside, model
 
 
 def _drift(prepared: Prepared) -> list[Judged]:

@@ -25,6 +25,7 @@ import numpy as np
 from omsm_ros.core.departures.families import DRIFT
 from omsm_ros.core.dynamics.calibration import RECORDED, Calibration
 from omsm_ros.core.dynamics.response_band import ResponseLimits
+from omsm_ros.core.fitting.axis_steps import check_axis_steps
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
 from omsm_ros.core.identification.certificate import certificate_of
@@ -104,9 +105,9 @@ def identify(
     be had but not trusted is returned with the verdict "rejected" in its certificate.
     """
     mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
-    searched = search(
-        prepare(record, input), lambda prepared: _chosen(prepared, order), may_grow=not order
-    )
+    prepared = prepare(record, input)
+    check_axis_steps(prepared)
+    searched = search(prepared, lambda prepared: _chosen(prepared, order), may_grow=not order)
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
     drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]

@@ -16,11 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import signal
 
 from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held_equivalent
-from omsm_ros.core.dynamics.response_band import Band, widening
+from omsm_ros.core.dynamics.response_band import Band, shown, widening
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.covariance import parameter_covariance
+from omsm_ros.core.fitting.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.identification.residual_tests import independence, whiteness
@@ -97,7 +98,7 @@ def identify_samples(
     choice = choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
     known = _Known.of(choice.chosen, choice.delay, period)
     known, factor = _no_surer(known, choice, period)
-    low, high = longest_range(known.band, SAMPLED_LIMITS)
+    low, high = longest_range(known.band, SAMPLED_LIMITS, _shown(known, choice.chosen))
     return SampledModel(
         hold=hold,
         sample_period=period,
@@ -116,6 +117,19 @@ def identify_samples(
             entries=_entries(choice, output[used]),
         ),
     )
+
+
+def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
+    """Return what lies between frequencies at which an error of the response would show, (k,)."""
+    problem, samples = candidate.problem, len(candidate.problem.used)
+    discrete, taper = known.discrete, signal.windows.hann(samples)
+    driven = signal.lfilter(discrete.numerator, discrete.denominator, problem.input)
+    answer = np.asarray(np.fft.rfft(taper * driven), np.complex128)
+    share = float(np.mean(problem.used))
+    noise = noise_spectrum(problem.residual(candidate.fit), samples) * float(taper @ taper) / share
+    lines = np.asarray(np.fft.rfftfreq(samples, problem.period), np.float64)
+    found = shown(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
+    return np.asarray(np.logical_or.accumulate(found) & np.logical_or.accumulate(found[::-1])[::-1])
 
 
 def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Known, float]:

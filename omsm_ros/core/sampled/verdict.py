@@ -8,6 +8,7 @@ import numpy as np
 
 from omsm_ros.core.dynamics.calibration import REJECTED
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, Band, ResponseLimits
+from omsm_ros.core.samples.blocks import BoolArray
 from omsm_ros.readable import chance, percent, plain, quantity
 
 # A tenth of the gain, and as much of a radian: a model of a process, not of a measuring machine.
@@ -18,14 +19,19 @@ _LEAST_PREDICTED = 0.5
 _LEAST_INDEPENDENCE_P = 1e-4
 
 
-def longest_range(band: Band, limits: ResponseLimits) -> tuple[float, float]:
+def longest_range(
+    band: Band, limits: ResponseLimits, shown: BoolArray | None = None
+) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, in which the 95 % band keeps within ``limits``.
 
+    shown: where the data would show a response beyond them, (k,) at the frequencies of the band;
+        None for everywhere
     Both ends are the lowest frequency of the band where there is none.
     """
     inside = (COVERAGE_FACTOR * band.gain <= limits.gain) & (
         COVERAGE_FACTOR * band.phase <= limits.phase
     )
+    inside = inside if shown is None else inside & shown
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
     if not len(edges):
         return float(band.frequency[0]), float(band.frequency[0])

@@ -185,3 +185,37 @@ class TestVerdict:
         band = Band(frequency, gain, np.zeros(7))
         assert longest_range(band, self.LIMITS) == (4.0, 16.0)
         assert longest_range(replace(band, phase=np.ones(7)), self.LIMITS) == (1.0, 1.0)
+
+
+def sines(frequencies, samples=4000):
+    time = np.arange(samples) * 1e-3
+    return sum(np.sin(2 * np.pi * f * time + f) for f in frequencies)
+
+
+def second_order(u, noise=0.01):
+    exact = signal.lfilter([0.0, 0.1, 0.1], [1.0, -1.5, 0.7], u)
+    return exact + np.random.default_rng(2).normal(0, noise, len(u))
+
+
+def test_a_model_is_valid_between_the_frequencies_of_the_input():
+    u = sines([5.0, 17.0, 60.0])
+    model = identify_samples(u, second_order(u), 1e-3)
+    # A third of an octave around a line counts as seen.
+    assert 5 / 1.3 < model.valid_from < 5
+    assert 60 < model.valid_up_to < 60 * 1.3
+
+
+@pytest.mark.parametrize(("lines", "order"), [([16.0], 0), ([16.0, 40.0], 2)])
+def test_more_poles_than_the_input_excites_are_refused_with_what_to_do(lines, order):
+    u = sines(lines)
+    excites = rf"excites {2 * len(lines)} parameters only.*steps, noise, or more"
+    with pytest.raises(IdentificationError, match=excites):
+        identify_samples(u, second_order(u), 1e-3, order=order)
+
+
+def test_a_square_wave_that_follows_two_sines_is_known_at_those():
+    """Its harmonics are none of any linear answer."""
+    u = sines([16.0, 23.0])
+    model = identify_samples(u, np.sign(np.roll(u, 3)), 1e-3)
+    assert model.valid_from >= 16 / 1.3
+    assert model.valid_up_to < 23 * 1.3
