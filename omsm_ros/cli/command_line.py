@@ -148,9 +148,7 @@ def _demo(args: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
+    _make_writable()
     if not given:
         say_lines(_WHAT_NEXT)
         return DONE
@@ -169,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(_nowhere(), sys.stdout.fileno())
         return DONE
     except MemoryError as err:
         _complain(f"memory is short: {err or 'none is left'}; give less at once")
@@ -178,6 +176,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get(DEBUG):
             raise
         return _unforeseen(err)
+
+
+def _make_writable() -> None:
+    """Let anything be written to the standard streams, also where they are closed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by who has started this
+            setattr(sys, name, os.fdopen(_nowhere(), "w"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
 
 
 def _unforeseen(err: Exception) -> int:
@@ -224,4 +232,11 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _complain(text: str) -> None:
-    print("omsm:", one_line(text), file=sys.stderr)
+    try:
+        print("omsm:", one_line(text), file=sys.stderr, flush=True)
+    except OSError:  # nobody can be told, but the exit status is right
+        os.dup2(_nowhere(), sys.stderr.fileno())
+
+
+def _nowhere() -> int:
+    return os.open(os.devnull, os.O_WRONLY)

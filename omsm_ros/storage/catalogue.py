@@ -40,9 +40,10 @@ class Catalogue:
     def __init__(self, address: str) -> None:
         self.address = address if "://" in address else f"{_SQLITE}{address}"
         kind = self.address.partition("://")[0]
-        if kind not in _KINDS:
+        if kind not in _KINDS or not _is_text(address):
             raise ConfigurationError(
-                f"catalogue {shown(address)}, expected a file, sqlite:///FILE or postgresql://…"
+                f"catalogue {shown(address)}, expected a file, sqlite:///FILE or postgresql://…, "
+                "in UTF-8"
             )
         if kind == "postgresql":
             self.address = self.address.replace("postgresql", "postgresql+psycopg", 1)
@@ -155,6 +156,15 @@ class Catalogue:
         except (ValueError, self._sql.exc.ArgumentError):
             return self.address.rpartition("@")[2]  # no address, and what may be a password
         return str(url.render_as_string(hide_password=True))
+
+
+def _is_text(address: str) -> bool:
+    """Whether it is Unicode; the name of a file may be any bytes, an address may not."""
+    try:
+        address.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _check(name: str, kind: type, values: Sequence[object]) -> None:

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -59,3 +61,10 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
     assert prediction["safe"]
     # The paper's twenty steps leave 1.0 nm, for they hide a slow relaxation.
     assert prediction["residual"] < 0.7e-9
+
+
+@pytest.mark.parametrize("redirected", ["2>&-", "2>/dev/full", ">&- 2>&-"])
+def test_the_exit_status_is_right_where_nobody_can_be_told(redirected, tmp_path):
+    command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
+    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")

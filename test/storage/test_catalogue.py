@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("sqlalchemy", reason="the extra 'catalogue' is not installed")
 
 from omsm_ros import cli
-from omsm_ros.errors import FileError
+from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs.keep_history import history, keep_calibration
 from omsm_ros.storage.catalogue import Catalogue
 
@@ -51,6 +51,11 @@ def test_a_view_without_end_is_given_up(address, monkeypatch):
         )
     with pytest.raises(FileError, match="interrupted"):
         history(address)
+
+
+def test_an_address_that_is_no_text_is_refused():
+    with pytest.raises(ConfigurationError, match="in UTF-8"):
+        Catalogue("a\udcff.sqlite")
 
 
 @pytest.mark.parametrize(
