@@ -14,16 +14,17 @@ from os import SEEK_END, fstat
 from pathlib import Path
 from struct import unpack_from
 from types import SimpleNamespace
-from typing import IO
+from typing import IO, Any
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError, storage_mcap
+from rosbags.rosbag2 import Reader, ReaderError, storage_mcap, storage_sqlite3
 from rosbags.rosbag2 import reader as bag_folder
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from omsm_ros.errors import BagError
+from omsm_ros.quantities import shown
 from omsm_ros.storage.files import open_regular, said
 
 # rosbag2 writes chunks of less than a megabyte, Foxglove of four.
@@ -34,6 +35,7 @@ _RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
 _MAX_METADATA_BYTES = 4 * 1024**2
 # What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
 _MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
+_OF_AN_ADDRESS = frozenset("%?#")
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 # No recording is packed a hundred times; one that is, and is large, was made to fill a disk.
 _MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
@@ -79,6 +81,9 @@ def check_files(path: Path) -> None:
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not part.is_dir():
             open_regular(part, BagError, "bag").close()
+        if part.suffix == ".db3" and set(str(part)) & _OF_AN_ADDRESS:
+            # rosbags makes an address of the path, and would read what lies elsewhere.
+            raise BagError(f"bag {str(part)!r} has one of '%?#' in its path; rename it")
     metadata = path / "metadata.yaml"
     if metadata.is_file() and metadata.stat().st_size > _MAX_METADATA_BYTES:
         raise BagError(
@@ -217,6 +222,15 @@ class _Unpacked:
         return part
 
 
+def _check_tables(base: Any) -> None:
+    """Raise BagError for a database in which a few bytes are computed into as many as one likes."""
+    base.limit(storage_sqlite3.apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+    computed = "SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) c WHERE c.hidden > 0"
+    for (name,) in base.execute(computed):
+        raise BagError(f"table {shown(name)} of the bag computes its columns; record it again")
+
+
+storage_sqlite3.apsw.connection_hooks.append(_check_tables)
 # rosbags unpacks whatever comes out, and looks at its size afterwards.
 storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
 bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)

@@ -1,8 +1,10 @@
 """Bags that are not what they claim to be."""
 
 import os
+import sqlite3
 import struct
 from binascii import crc32
+from contextlib import closing
 from time import process_time
 
 import numpy as np
@@ -258,3 +260,31 @@ def test_definitions_that_take_minutes_to_take_apart_are_not(tmp_path):
     with pytest.raises(BagError, match="another definition of"):
         records(path)
     assert process_time() - start < 1.0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "ALTER TABLE topics ADD COLUMN a BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL",
+        "CREATE VIRTUAL TABLE v USING fts5(a)",
+    ],
+)
+def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, message, change):
+    """A few bytes of it would be read as 900 MB, once a row."""
+    folder = foreign_bag(tmp_path / "bag", [message], plugin=StoragePlugin.SQLITE3)
+    (base,) = folder.glob("*.db3")
+    with closing(sqlite3.connect(base)) as connection, connection:
+        connection.execute(change)
+    for path in (folder, base):
+        with pytest.raises(BagError, match="of the bag computes its columns"):
+            records(path)
+
+
+def test_a_path_that_would_be_read_as_an_address_is_refused(tmp_path, message):
+    """Of "%41" SQLite makes "A": another file would be read."""
+    folder = foreign_bag(tmp_path / "A", [message], plugin=StoragePlugin.SQLITE3)
+    other = folder.rename(tmp_path / "%41")
+    foreign_bag(tmp_path / "A", [message] * 2, plugin=StoragePlugin.SQLITE3)
+    assert len(records(tmp_path / "A")) == 2
+    with pytest.raises(BagError, match="rename it"):
+        records(other)
