@@ -13,6 +13,7 @@ import numpy as np
 from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
+from omsm_ros.readable import quantity
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
 
 # Places that are named; of more, the number.
@@ -27,11 +28,13 @@ class StreamWatch:
     missing: trigger counts left out;  gaps: the first places, each (first, last) of what is missing
     places, restarts, repeated: gaps in all, times that the count began anew, samples seen twice
     invalid, samples: readings of the probe, or places of the axes, that are none, of all
+    least, most: of the valid readings of the probe [m]
     """
 
     def __init__(self) -> None:
         self.missing = self.places = self.restarts = self.repeated = 0
         self.invalid = self.samples = 0
+        self.least, self.most = np.inf, -np.inf
         self.gaps: list[tuple[int, int]] = []
         self.periods: set[float] = set()
         self._count = TriggerCount()
@@ -56,6 +59,9 @@ class StreamWatch:
             self._marks[arrival.session].append((block.first_sample, block.stamp_ns))
         if isinstance(block, DistanceBlock):
             self.invalid += int(np.sum(~block.ok))
+            valid = block.distance[block.ok]
+            self.least = float(np.min(valid, initial=self.least))
+            self.most = float(np.max(valid, initial=self.most))
         elif isinstance(block, AxisBlock):
             axes = np.array([block.x, block.y, block.z, block.b, block.c])
             self.invalid += int(np.sum(~np.all(np.isfinite(axes), axis=0)))
@@ -90,6 +96,12 @@ class StreamWatch:
             yield f"{name}: sample periods from {min(self.periods)} s to {max(self.periods)} s"
         if self.invalid == self.samples:
             yield f"{name}: not one of {self.samples} readings is valid"
+        elif self.least == self.most and self.samples - self.invalid > 1:
+            yield (
+                f"{name}: all {self.samples - self.invalid} valid readings are "
+                f"{quantity(self.least, 'm')}, to the last digit: a probe scatters; look whether "
+                "it measures, and whether its driver passes on what it sends"
+            )
 
 
 def counter_skew(axes: StreamWatch, distance: StreamWatch) -> float | None:

@@ -70,6 +70,18 @@ def test_another_period_and_a_probe_that_sees_nothing() -> None:
     assert "not one of 100 readings is valid" in faults(blind)[0]
 
 
+def test_a_probe_that_never_changes_is_named_with_what_it_says() -> None:
+    still = [replace(distance(first), distance=np.full(100, 12.3e-6)) for first in (0, 100)]
+    (said,) = faults(*still)
+    assert "all 200 valid readings are 12.3 µm" in said
+    moved = replace(still[1], distance=np.append(np.full(99, 12.3e-6), 12.300001e-6))
+    assert faults(still[0], moved) == []
+    lost = replace(
+        still[0], status=np.append(np.full(99, Status.NO_TARGET), Status.OK).astype("u1")
+    )
+    assert faults(lost) == []
+
+
 @pytest.mark.parametrize("samples", [1, -1, 10, 100, 400])
 def test_a_counter_that_is_off_is_found_by_the_stamps(samples: int) -> None:
     one = watched(*(axes(first) for first in range(0, 5000, 100)))
