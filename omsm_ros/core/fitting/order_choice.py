@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.effort import Effort
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.samples.blocks import BoolArray
@@ -69,10 +70,12 @@ def explore(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     order: int = 0,
     colour: float = 1.0,
+    effort: Effort | None = None,
 ) -> list[Candidate]:
     """Fit structures of rising order until two more poles in a row gain nothing.
 
     order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
+    effort: of the fits; once it is spent no further order is begun
 
     Raises IdentificationError for an order that is no number of poles to try.
     """
@@ -86,7 +89,8 @@ def explore(
             fitted = fit_structure(structure, [c.fit for c in found])
             found.append(Candidate(fitted, information(fitted, colour)))
         fruitless = 0 if min(c.bic for c in found) < before else fruitless + 1
-        if fruitless >= 2 and poles >= order:
+        enough = fruitless >= 2 or (effort is not None and effort.spent)
+        if enough and poles >= order:
             break
     return found
 

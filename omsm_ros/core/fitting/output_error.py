@@ -12,13 +12,14 @@ Pereyra 1973, with Kaufman's simplification of the derivative).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from scipy import fft, linalg
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.fitting.effort import Effort
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
@@ -54,6 +55,7 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
+    effort: what was tried of this problem, and of those made of it
     """
 
     input: FloatArray
@@ -66,6 +68,7 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
+    effort: Effort = field(default_factory=Effort)
 
     @cached_property
     def closed_length(self) -> int:
@@ -74,8 +77,7 @@ class Problem:
 
     def closed_spectrum(self, values: FloatArray) -> ComplexArray:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
-        closed = fft.rfft(close_period(values, self.period))
-        return np.asarray(closed, np.complex128)[: len(self.s)]
+        return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
@@ -114,8 +116,8 @@ class Problem:
         """Return the decays (n, poles) at the poles of ``fitted`` from before the first sample."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
-        spectra = powers * (lag * self._pulse)
-        return np.asarray(fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T)
+        decays = fft.irfft(powers * (lag * self._pulse), self.closed_length)
+        return np.asarray(decays[:, : len(self.input)].T)
 
     @cached_property
     def _target(self) -> FloatArray:
@@ -130,11 +132,11 @@ class Problem:
         return self.background[self.used]
 
     def _in_time(self, spectrum: ComplexArray) -> FloatArray:
-        back = fft.irfft(spectrum, self.closed_length, axis=-1)
-        return np.asarray(np.take(back, self._places, axis=-1), np.float64)
+        return np.take(fft.irfft(spectrum, self.closed_length, axis=-1), self._places, axis=-1)
 
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
+        self.effort.comparisons += 1
         lag, relative = scaled.lag(nonlinear, self.s)
         driven = self._driven(scaled.structure, lag)
         # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
@@ -177,8 +179,8 @@ class Problem:
     def modelled(self, fitted: Fit) -> FloatArray:
         """Return the output (n,) of the fitted model at every sample."""
         lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
-        spectrum = fitted.driven @ self._driven(fitted.structure, lag)
-        moved = fft.irfft(spectrum, self.closed_length)[: len(self.input)]
+        driven = fitted.driven @ self._driven(fitted.structure, lag)
+        moved = fft.irfft(driven, self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
@@ -189,8 +191,8 @@ class Problem:
         by_numerator = fitted.gain * driven[1:terms]
         by_nonlinear = relative * (fitted.driven @ driven)
         by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
-        every = np.concatenate([by_numerator, by_nonlinear, by_gain, driven[terms:]])
-        return np.column_stack([self._in_time(every).T, self._fixed])
+        moved = self._in_time(np.concatenate([by_numerator, by_nonlinear, by_gain, driven[terms:]]))
+        return np.column_stack([moved.T, self._fixed])
 
     def bent(self, fitted: Fit) -> FloatArray:
         """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
@@ -201,9 +203,8 @@ class Problem:
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
-        return np.column_stack(
-            [self._in_time(np.concatenate([bends, driven[terms:]])).T, self._fixed]
-        )
+        moved = self._in_time(np.concatenate([bends, driven[terms:]]))
+        return np.column_stack([moved.T, self._fixed])
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,9 +343,8 @@ def _damped_step(
     curvature: FloatArray, slope: FloatArray, scale: FloatArray, free: BoolArray, damping: float
 ) -> FloatArray:
     unit = scale[free]
-    matrix = curvature[np.ix_(free, free)] / np.outer(unit, unit)
+    damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
     step = np.zeros_like(slope)
-    damped = matrix + damping * np.eye(len(unit))
     step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
     # Logarithms of time constants: further than this in one step is a leap in the dark.
     return np.asarray(np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))

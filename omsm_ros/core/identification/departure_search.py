@@ -35,9 +35,6 @@ from omsm_ros.core.identification.model_choice import Model
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
-# Poles of all fits, after which no round begins. Of 450 disturbed step tests those accepted in the
-# end had at most 82 before their last round; what is not linear asks for ever more.
-_MOST_POLES = 120
 _BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Their columns follow the fitted response, which they improve.
 _TURNING = {BACKLASH, FRICTION}
@@ -93,8 +90,6 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
 
     choose: fits a prepared problem anew;  may_grow: poles may be added to the model
     """
-    fitted: list[Candidate] = []
-    choose = _keeping(choose, fitted)
     prepared, beside, model = _first(prepared, choose)
     grown: list[Term] = []
     without: list[Survey] = []
@@ -104,7 +99,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
     survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
         shown = _but_lines(survey.significant(refused | settled), modes)
-        if not shown or sum(c.fit.structure.poles for c in fitted) > _MOST_POLES:
+        if not shown or prepared.problem.effort.spent:
             break
         columns = _beside(survey, shown)
         again = {c.term.family for c in columns} & _TURNING & {b.term.family for b in beside}
@@ -128,17 +123,6 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
             without.append(survey)
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     return Searched(prepared, model, survey, beside, grown, survey.significant(settled), without)
-
-
-def _keeping(choose: Choose, fitted: list[Candidate]) -> Choose:
-    """Return ``choose`` that adds to ``fitted`` what it tried."""
-
-    def kept(prepared: Prepared) -> tuple[Prepared, Model]:
-        prepared, model = choose(prepared)
-        fitted.extend(model.candidates)
-        return prepared, model
-
-    return kept
 
 
 def _first(prepared: Prepared, choose: Choose) -> tuple[Prepared, list[ModelledTerm], Model]:

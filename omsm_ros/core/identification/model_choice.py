@@ -40,7 +40,8 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
-    explored = explore(fit_structure, order, noise_colour(problem, lag, prepared.steps))
+    colour = noise_colour(problem, lag, prepared.steps)
+    explored = explore(fit_structure, order, colour, problem.effort)
     candidates = _identifiable(problem, explored)
     free = Model(choose(candidates), candidates)
     if not order:

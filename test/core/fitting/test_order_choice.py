@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.fitting.effort import Effort
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.order_choice import (
     Candidate,
@@ -79,6 +80,16 @@ def test_a_structure_has_one_or_two_zeros_fewer_and_a_delay_or_none_the_smallest
         }
         assert len(tried) == 4
         assert [s.size for s in tried] == sorted(s.size for s in tried)
+
+
+def test_no_order_is_begun_once_enough_was_tried():
+    spent = Effort(comparisons=10**6)
+    to = [
+        max(c.fit.structure.poles for c in explore(fitter(problem_of(PAIR)), order, effort=spent))
+        for order in (0, 3)
+    ]
+    assert to == [0, 3]
+    assert max(c.fit.structure.poles for c in explored(PAIR)) > 0
 
 
 @pytest.mark.parametrize("order", [-1, 21, 1000])
