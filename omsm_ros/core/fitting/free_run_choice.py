@@ -16,7 +16,6 @@ from scipy import signal
 
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
-from omsm_ros.core.fitting.excitation import excited_parameters
 from omsm_ros.core.fitting.held_problem import RATE_SAMPLES, DiscreteScaled, HeldProblem
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Fit, fit
@@ -44,6 +43,11 @@ _DELAY_ORDER = 3
 _LEAST_SAMPLES_EACH = 3
 # Sixty columns of them, and their spectra, take a third of a gigabyte.
 _MOST_SAMPLES = 200_000
+# Of the refit without a hidden part, which starts at the minimum over all of them: what more would
+# gain is less than what one part misjudges by, and on orders beyond ten takes most of the time.
+_HIDDEN_EVALUATIONS = 5
+# Of the power of the strongest direction: what is weaker is rounding of a text with six digits.
+_UNEXCITED = 1e-12
 # Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
 _FAST = float(np.log(0.1))
 
@@ -156,6 +160,18 @@ def _highest_order(samples: int, order: int) -> int:
     return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
 
 
+def excited_parameters(input: FloatArray, most: int) -> int:
+    """Return how many parameters ``input`` (n,) can tell, at most ``most``.
+
+    The order to which it is persistently exciting beside a constant (Ljung 1999, ch. 13): of all
+    windows of ``most`` samples, how many are independent. Each sine gives two; noise, all.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(input, most)
+    varied = windows - np.mean(windows, axis=0)
+    power = np.linalg.eigvalsh(varied.T @ varied)
+    return int(np.sum(power > _UNEXCITED * power[-1]))
+
+
 def _most_excited(input: FloatArray, most: int, order: int) -> int:
     """Return the highest order, at most ``most``, whose numerator and denominator show."""
     excited = excited_parameters(input, min(2 * most + 1, len(input)))
@@ -255,9 +271,12 @@ def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
     return np.concatenate([first, [merged], second, [nonlinear[pairs] + log_time]])
 
 
-def _refitted(problem: HeldProblem, start: Fit, whitened: bool) -> Fit:
-    """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``."""
-    found = fit(problem, start.structure, [start.nonlinear])
+def _refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
+    """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``.
+
+    evaluations: of a fit, as of :func:`fit` if not given
+    """
+    found = fit(problem, start.structure, [start.nonlinear], *evaluations)
     if not whitened:
         return found
     whitener, _ = autoregression(found.residual)
@@ -271,7 +290,7 @@ def _refitted(problem: HeldProblem, start: Fit, whitened: bool) -> Fit:
         output=signal.lfilter(whitener, 1.0, problem.output),
         used=problem.used & apart & ~lost,
     )
-    return fit(white, start.structure, [found.nonlinear])
+    return fit(white, start.structure, [found.nonlinear], *evaluations)
 
 
 def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
@@ -300,7 +319,7 @@ def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
     errors = []
     for samples in hidden:
         rest = replace(problem, used=problem.used & ~samples)
-        found = _refitted(rest, candidate.fit, candidate.whitened)
+        found = _refitted(rest, candidate.fit, candidate.whitened, _HIDDEN_EVALUATIONS)
         errors.append(_missed(rest, found, samples))
     return np.array(errors)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.effort import Effort
+from omsm_ros.core.fitting.descent import Effort
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.samples.blocks import BoolArray

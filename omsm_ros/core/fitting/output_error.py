@@ -11,7 +11,7 @@ Pereyra 1973, with Kaufman's simplification of the derivative).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft, linalg
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.fitting.effort import Effort
+from omsm_ros.core.fitting.descent import Effort, Projection, descend
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.periodic_input import close_period, motion_spectrum
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
@@ -31,16 +31,6 @@ _RANK_TOLERANCE = 1e-12
 _RACE_EVALUATIONS = 5
 # A bound for fits that creep along a valley; others end by convergence before.
 _FINISH_EVALUATIONS = 60
-# Madsen, Nielsen and Tingleff (2004) advise it where the start is no more than fair.
-_FIRST_DAMPING = 1e-3
-# A parameter that changes the output this much less than another is not identifiable.
-_INSENSITIVE = 1e-10
-# Relative to 1 + |ψ|: smaller ones change no digit of a coefficient that is printed.
-_SMALLEST_STEP = 1e-9
-# In ψ, the logarithm of a coefficient: a factor of twenty, beyond which no quadratic model holds.
-_LONGEST_STEP = 3.0
-# Of what one parameter gains by chance.
-_CONVERGED = 1e-4
 # The pulse before a record has this content left, as a power of e, where its band ends.
 _PULSE_END = 14.0
 
@@ -208,26 +198,6 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
-    """At one ψ, ``nonlinear``: residual (k,), linear parameters (m + 1 + q,)."""
-
-    nonlinear: FloatArray
-    residual: FloatArray
-    linear: FloatArray
-    derivative: Callable[[], FloatArray]
-
-    @cached_property
-    def jacobian(self) -> FloatArray:
-        """Derivative of the residual by ψ, (k, len ψ); where no step starts, none is needed."""
-        return self.derivative()
-
-    @cached_property
-    def normal_equations(self) -> tuple[FloatArray, FloatArray]:
-        """Return half the slope of the sum of squares (len ψ,) and its curvature."""
-        return self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
-
-
-@dataclass(frozen=True, eq=False)
 class Fit:
     """A fitted structure.
 
@@ -282,69 +252,30 @@ class Fit:
         return self.scaled.transfer_function(self.nonlinear, self.numerator)
 
 
-def fit(problem: Problem, structure: Structure, starts: Sequence[FloatArray]) -> Fit:
-    """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them."""
+def fit(
+    problem: Problem,
+    structure: Structure,
+    starts: Sequence[FloatArray],
+    evaluations: int = _FINISH_EVALUATIONS,
+) -> Fit:
+    """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them.
+
+    evaluations: to that minimum, at most
+    """
     scaled = problem.parametrised(structure)
+    box = scaled.bounds()
+
+    def project(nonlinear: FloatArray) -> Projection:
+        return problem.project(scaled, nonlinear)
+
     best, least = None, np.inf
     for start in starts:
-        within = problem.project(scaled, np.clip(start, *scaled.bounds()))
-        found = _descend(problem, scaled, within, _RACE_EVALUATIONS)
+        found = descend(project, project(np.clip(start, *box)), box, _RACE_EVALUATIONS)
         cost = float(np.sum(found.residual**2))
         if best is None or cost < least:
             best, least = found, cost
     if best is None:
         raise ValueError("no start to fit from, expected one or more")
-    at = _descend(problem, scaled, best, _FINISH_EVALUATIONS)
+    at = descend(project, best, box, evaluations)
     terms = len(at.linear) - problem.background.shape[1]
     return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)
-
-
-def _descend(problem: Problem, scaled: Scaled, start: Projection, evaluations: int) -> Projection:
-    """Minimise inside the box by Levenberg and Marquardt's method, damped after Nielsen (1999).
-
-    On normal equations: a handful of parameters against many samples, whose scale is taken
-    out. A general solver factorises the whole jacobian at each step, and takes ten times as long.
-    """
-    at = start
-    if not len(at.nonlinear):
-        return at
-    lower, upper = scaled.bounds()
-    damping, growth = _FIRST_DAMPING, 2.0
-    cost = float(at.residual @ at.residual)
-    for _ in range(evaluations):
-        nonlinear = at.nonlinear
-        slope, curvature = at.normal_equations
-        # A parameter at its bound that would leave the box stays.
-        free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
-        scale = np.sqrt(np.diag(curvature))
-        free &= scale > _INSENSITIVE * np.max(scale)
-        if not np.any(free):
-            break
-        step = _damped_step(curvature, slope, scale, free, damping)
-        tried = problem.project(scaled, np.clip(nonlinear + step, lower, upper))
-        new_cost = float(tried.residual @ tried.residual)
-        if not new_cost < cost:
-            moved = np.abs(tried.nonlinear - nonlinear)
-            if np.all(moved <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
-                break
-            damping, growth = damping * growth, growth * 2
-            continue
-        gained, promised = cost - new_cost, -float(step @ (2 * slope + curvature @ step))
-        at, cost = tried, new_cost
-        ratio = gained / promised if promised > 0 else 1.0
-        damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
-        # χ² that changes by less than this is converged.
-        if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
-            break
-    return at
-
-
-def _damped_step(
-    curvature: FloatArray, slope: FloatArray, scale: FloatArray, free: BoolArray, damping: float
-) -> FloatArray:
-    unit = scale[free]
-    damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
-    step = np.zeros_like(slope)
-    step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
-    # Logarithms of time constants: further than this in one step is a leap in the dark.
-    return np.asarray(np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))

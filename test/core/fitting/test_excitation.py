@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.fitting.excitation import excited_parameters
+from omsm_ros.core.fitting.free_run_choice import excited_parameters
 
 TIME = np.arange(3000) * 1e-3
 

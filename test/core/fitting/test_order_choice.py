@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.effort import Effort
+from omsm_ros.core.fitting.descent import Effort
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.order_choice import (
     Candidate,
