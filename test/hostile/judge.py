@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -146,3 +147,12 @@ def _check(facts: dict[str, object], folder: Path) -> None:
             for name in ("x", "y", "height", "dynamic_error", "uncertainty"):
                 assert np.isfinite(cloud[name]).all(), name
             assert (cloud["uncertainty"] >= 0).all()
+
+
+def refused(place: Path, words: Sequence[str], name: str, raw: bytes) -> str:
+    """Return what the command ``words`` says of the file ``name``, whose content is ``raw``."""
+    case = Case((*(word.replace("{}", name) for word in words), "--json"), {name: raw})
+    answer = ask(case, place)
+    assert answer.status == 2, answer
+    judge(case, answer, place)
+    return answer.err

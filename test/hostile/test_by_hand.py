@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile import maps, trees
-from hostile.judge import Case, ask, ask_process, judge
+from hostile.judge import Case, ask, ask_process, judge, refused
 
 from omsm_ros.errors import FileError
 from omsm_ros.storage.bags import AXES_TOPIC, DISTANCE_TOPIC, BagReader
@@ -38,14 +38,6 @@ def place(tmp_path_factory) -> Path:
     (folder / "latin").write_bytes(b"\xff\xfe\xe9: 1\n\x80")
     os.mkfifo(folder / "pipe")
     return folder
-
-
-def refused(place: Path, words: tuple[str, ...], name: str, raw: bytes) -> str:
-    case = Case((*(word.replace("{}", name) for word in words), "--json"), {name: raw})
-    answer = ask(case, place)
-    assert answer.status == 2, answer
-    judge(case, answer, place)
-    return answer.err
 
 
 # Archives.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile import maps, trees
-from hostile.judge import Case, ask, judge
+from hostile.judge import refused
 
 EXPORT = ("export", "{}", "--unit", "m", "--out", "e.x3p")
 IMPORT = ("import", "{}", "--map", "map.yaml", "--out", "new.mcap")
@@ -23,14 +23,6 @@ def place(tmp_path_factory) -> Path:
     (folder / "surface.yaml").write_text("shape: sphere\nradius: -0.1\n")
     os.mkfifo(folder / "pipe")
     return folder
-
-
-def refused(place: Path, words: tuple[str, ...], name: str, raw: bytes) -> str:
-    case = Case((*(word.replace("{}", name) for word in words), "--json"), {name: raw})
-    answer = ask(case, place)
-    assert answer.status == 2, answer
-    judge(case, answer, place)
-    return answer.err
 
 
 @pytest.mark.parametrize("size", [5e-324, 1e-320, 1e-200])
