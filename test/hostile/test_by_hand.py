@@ -113,7 +113,7 @@ _XYZ = "property float x\nproperty float y\nproperty float z\n"
         ("a.csv", "x_mm,y_mm,height_mm,u_mm\n" + "1,2,3,-5\n" * 300, "uncertainty[0] is -0.005 m"),
         ("a.csv", "x_mm,y_mm,height_mm,sample\n" + "1,2,3,1e300\n" * 300, "sample[0] is 1e+300"),
         ("a.dat", "1000000 1000000 1 1 0\n1 0 0 0\n", "number of points is 1000000000000"),
-        ("a.dat", "5 5 1e300 1 0\n" + "1 0 0 0\n" * 25, "x[0] is -2e+297 m"),
+        ("a.dat", "5 5 1e300 1 0\n" + "1 0 0 0\n" * 25, "spacing dx of the map is 1e+297 m"),
     ],
 )  # fmt: skip
 def test_counts_and_coordinates_that_cannot_be_are_named(place, name, text, told):
