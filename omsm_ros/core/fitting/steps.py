@@ -19,6 +19,8 @@ from omsm_ros.readable import counted, quantity
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
 LEAST_SAMPLES = 50
+# A step test of ten seconds at 70 kHz; each takes 1.3 kB in a fit and its covariance.
+_MOST_SAMPLES = 800_000
 # Far beyond the range of any probe that could have seen the motion.
 _GREATEST_TRAVEL_M = 20e-3
 # Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
@@ -154,8 +156,13 @@ def backlash_columns(steps: Steps, samples: int) -> FloatArray:
 
 
 def check_usable(record: MotionRecord) -> None:
-    """Raise StepTestError when too few samples of the record can be used, saying why."""
+    """Raise StepTestError for too few samples that can be used, or too many, saying why."""
     _check_length(len(record))
+    if len(record) > _MOST_SAMPLES:
+        raise StepTestError(
+            f"{len(record)} samples are more than can be fitted in a gigabyte of memory, "
+            f"{_MOST_SAMPLES}; record a shorter test, or trigger encoder and probe less often"
+        )
     usable = int(np.sum(record.ok))
     if usable < LEAST_SAMPLES:
         raise StepTestError(

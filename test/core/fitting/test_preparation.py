@@ -7,7 +7,7 @@ from omsm_ros.core.fitting.periodic_input import close_period
 from omsm_ros.core.fitting.preparation import from_rest_to_rest, input_bandwidth, prepare
 from omsm_ros.core.machine.trajectories import Chirp, StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.errors import IdentificationError
+from omsm_ros.errors import IdentificationError, StepTestError
 
 TIME = np.arange(round(StepTest().duration / 1e-3)) * 1e-3
 STEPS = StepTest().positions(TIME).z
@@ -60,6 +60,12 @@ def test_content_is_counted_by_the_energy_of_the_velocity(share, expected):
     slow, fast = (np.sin(2 * np.pi * f * time) / f for f in (2.0, 20.0))
     motion = slow + np.sqrt(share / (1 - share)) * fast
     assert input_bandwidth(motion, 1e-3) == pytest.approx(expected, abs=0.3)
+
+
+def test_a_record_beyond_a_gigabyte_is_refused_before_it_is_fitted():
+    z = np.zeros(800_001)
+    with pytest.raises(StepTestError, match=r"800001 samples .* 800000; record a shorter test"):
+        prepare(MotionRecord.from_arrays(1e-3, z, z), "encoder")
 
 
 def test_the_probes_gain_must_be_plausible():
