@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -159,6 +160,8 @@ class CorrectorNode(ManagedNode):
     async def _on_predict(
         self, request: PredictError.Request, response: PredictError.Response
     ) -> None:
+        # What cannot be predicted is no error of zero.
+        response.peak_to_valley = response.rms = response.outside_band_fraction = math.nan
         prediction = await self._aside.do(
             partial(
                 _prediction,

@@ -2,6 +2,7 @@
 
 import signal
 
+import numpy as np
 import pytest
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from std_srvs.srv import Trigger
@@ -159,6 +160,7 @@ def test_corrector_without_calibration_counts_and_waits(cell, true_calibration):
 
     answer = cell.call(PredictError, "corrector/predict_error", z=[0.0, 1e-6], sample_period=1e-3)
     assert not answer.safe
+    assert np.isnan([answer.peak_to_valley, answer.rms, answer.outside_band_fraction]).all()
     assert "no calibration" in answer.message
 
     text = cell.folder / "notes.txt"
