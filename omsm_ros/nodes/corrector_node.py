@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -161,7 +160,7 @@ class CorrectorNode(ManagedNode):
         self, request: PredictError.Request, response: PredictError.Response
     ) -> None:
         # What cannot be predicted is no error of zero.
-        response.peak_to_valley = response.rms = response.outside_band_fraction = math.nan
+        response.peak_to_valley = response.rms = response.outside_band_fraction = float("nan")
         prediction = await self._aside.do(
             partial(
                 _prediction,
