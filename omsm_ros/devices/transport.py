@@ -16,7 +16,9 @@ from serial.tools import list_ports
 from omsm_ros.errors import ConfigurationError, DeviceError
 
 DEFAULT_BAUD_RATE = 921_600
-_CHUNK_BYTES = 65_536
+# What waited while this process stood still comes in pieces: decoded at once, two seconds of it
+# left half a megabyte of holes in the memory of the process.
+_CHUNK_BYTES = 16_384
 ADS_SCHEME = "ads://"
 _TCP_SCHEME = "tcp://"
 # First probe after so many seconds, the next ones, and how many go unanswered before it is lost;
