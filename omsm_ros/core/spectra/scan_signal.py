@@ -92,6 +92,11 @@ def scan_signal(
     turn = counted_on(count, c) / (2 * np.pi)
     inside = (sample >= count[0]) & (sample <= count[-1])
     sample, height = sample[inside], height[inside]
+    if len(sample) < _LEAST_POINTS:
+        raise DataError(
+            f"scan {name!r} has {len(sample)} readings between the trigger numbers of its "
+            f"positions, expected {_LEAST_POINTS} or more; record both from the same triggers"
+        )
     columns = (track(x, y, turn), np.hypot(x, y), turn)
     path, radius, turn = (np.interp(sample, count, values) for values in columns)
     return ScanSignal(

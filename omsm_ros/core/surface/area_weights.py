@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.quantities import MAP_SPACING
 
 # A raster passes the axis now on this side, now on that, and never gets around it twice.
 _LEAST_TURNS = 2.0
@@ -158,6 +159,7 @@ def _filled_side(x: FloatArray, y: FloatArray, side: int) -> int:
 def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int, int]]:
     """Return the cell of each point (n,), and how many there are in x and y; ``side`` at most."""
     spans = np.array([np.ptp(x), np.ptp(y)])
+    spans[spans < MAP_SPACING.low] = 0.0  # one place, but for the last bits
     counts = np.maximum(np.round(side * spans / (spans.max() or 1.0)), 1.0).astype(np.int64)
     places = [
         # What lies on the far edge lies in the last cell.

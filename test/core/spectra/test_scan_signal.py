@@ -69,3 +69,10 @@ def test_too_short_a_scan_is_refused():
     still = np.zeros(100)
     with pytest.raises(DataError, match=r"100 readings.*expected 256"):
         scan_signal("A", 1e-3, (few, still), (few, still, still, still))
+
+
+def test_readings_and_positions_of_other_triggers_are_refused():
+    still = np.zeros(1000)
+    early, late = np.arange(1000), np.arange(1000) + 900
+    with pytest.raises(DataError, match=r"100 readings between the trigger numbers.*expected 256"):
+        scan_signal("A", 1e-3, (early, still), (late, still, still, still))

@@ -194,3 +194,9 @@ def test_points_told_again_or_a_rest_take_no_area_from_the_others():
     share = rested[:9000] / rested[:9000].mean()
     assert np.all(np.isfinite(rested))
     np.testing.assert_allclose(share[:8000], once[:8000], rtol=2e-2)
+
+
+def test_places_that_are_one_but_for_their_last_bits_weigh_alike() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.integers(0, 9, (2, 500)) * 5e-324
+    assert np.mean(area_weights(x, y)) == pytest.approx(1.0)
