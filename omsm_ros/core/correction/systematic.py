@@ -19,6 +19,7 @@ from omsm_ros.core.machine.kinematics import workpiece_xy
 from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.quantities import MAP_SPACING
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 
@@ -149,7 +150,8 @@ def standard_fields(
 def _polynomial_slopes(
     x: FloatArray, y: FloatArray, height: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    scale = float(max(np.max(abs(x), initial=0.0), np.max(abs(y), initial=0.0))) or 1.0
+    scale = float(max(np.max(abs(x), initial=0.0), np.max(abs(y), initial=0.0)))
+    scale = scale if scale > MAP_SPACING.low else 1.0  # all is one place, but for the last bits
     powers = [(i, j) for i in range(_POLYNOMIAL_DEGREE + 1) for j in range(i + 1)]
     u, v = (np.vander(a / scale, _POLYNOMIAL_DEGREE + 1, increasing=True) for a in (x, y))
     design = np.stack([u[:, i - j] * v[:, j] for i, j in powers], axis=1)

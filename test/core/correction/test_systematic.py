@@ -141,6 +141,13 @@ def test_slopes_without_a_nominal_surface_are_those_of_the_points(points: ScanPo
     assert np.max(abs(free.slope_x - points.slope_x)) < 1e-3 * np.max(abs(points.slope_x))
 
 
+def test_places_that_are_one_but_for_their_last_bits_have_no_slope(points: ScanPoints) -> None:
+    bits = np.arange(len(points)) % 7 * 5e-324
+    found = replace(points, x=bits, y=bits[::-1]).with_slopes(None)
+    assert found.slope_x is not None
+    assert np.max(np.abs(found.slope_x)) < 1e-3
+
+
 def test_without_slopes_what_needs_them_is_refused() -> None:
     blind = replace(spiral_points(50), slope_x=None, slope_y=None)
     for name, kind in KINDS.items():
