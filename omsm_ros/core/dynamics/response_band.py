@@ -111,7 +111,7 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
     return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
 
 
-def shown(
+def would_show(
     centres: FloatArray,
     frequency: FloatArray,
     answer: ComplexArray,
@@ -142,8 +142,8 @@ def shown_up_to(
 ) -> float:
     """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
 
-    Arguments as of :func:`shown`; 0 where they show it nowhere.
+    Arguments as of :func:`would_show`; 0 where they show it nowhere.
     """
     centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
-    found = np.flatnonzero(shown(centres, frequency, answer, noise, limits))
+    found = np.flatnonzero(would_show(centres, frequency, answer, noise, limits))
     return float(centres[found[0]]) if len(found) else 0.0

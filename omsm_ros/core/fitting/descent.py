@@ -20,8 +20,8 @@ _SMALLEST_STEP = 1e-9
 _LONGEST_STEP = 3.0
 # Of what one parameter gains by chance.
 _CONVERGED = 1e-4
-# Of 350 disturbed step tests those that were accepted had at most 1200 before their last round,
-# and clean ones 150; in 1500 a record of 20 s at 1 kHz takes five seconds.
+# Of 270 disturbed step tests those that were accepted had at most 1200 before their last round,
+# and half of them fewer than 250 in all; 1500 of 20 s at 1 kHz take five to eight seconds.
 _ENOUGH = 1500
 
 

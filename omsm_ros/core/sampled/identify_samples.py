@@ -19,7 +19,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held_equivalent
-from omsm_ros.core.dynamics.response_band import Band, shown, widening
+from omsm_ros.core.dynamics.response_band import Band, widening, would_show
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
@@ -128,7 +128,7 @@ def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
     share = float(np.mean(problem.used))
     noise = noise_spectrum(problem.residual(candidate.fit), samples) * float(taper @ taper) / share
     lines = np.asarray(np.fft.rfftfreq(samples, problem.period), np.float64)
-    found = shown(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
+    found = would_show(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
     return np.asarray(np.logical_or.accumulate(found) & np.logical_or.accumulate(found[::-1])[::-1])
 
 
