@@ -1,4 +1,4 @@
-"""A short step test whose probe is late, fitted by a delay: what is added to it departs from that."""
+"""A short step test whose probe is late, fitted by a delay, and what departs from that."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Gap and friction against the same written value by value, and what holds of both for any motion."""
+"""Gap and friction against the same written value by value, and what holds for any motion."""
 
 import numpy as np
 import pytest

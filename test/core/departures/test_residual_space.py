@@ -1,4 +1,4 @@
-"""The score test against least squares of everything at once, by which it is the same (Frisch, Waugh)."""
+"""The score test against least squares of everything at once: the same, by Frisch and Waugh."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def columns_like(survey, count, seed=3):
 
 
 def at_once(survey, columns):
-    """Return coefficients of ``columns`` fitted beside all that the fit may change, and χ²'s sum."""
+    """Return coefficients of ``columns`` beside all that the fit may change, and squares left."""
     used = survey.problem.used
     every = np.column_stack([survey.problem.sensitivity(survey.fitted), columns[used]])
     scale = np.linalg.norm(every, axis=0)

@@ -141,7 +141,7 @@ class TestReferenceLag:
         assert reference_lag(self.record(np.zeros(4000))) is None
 
     def test_offset_drift_scale_and_holes_in_either_leave_the_lag(self):
-        """To first order: a sine is 0.4 % of a sample's lag off at this rate, second differences."""
+        """The lag is small against the period, so that its first order is all."""
         late = 150e-6
         reference = -0.5 * 20e-6 * np.sin(2 * np.pi * 1.3 * (self.TIME - late))
         reference += 3e-3 + 2e-6 * self.TIME
