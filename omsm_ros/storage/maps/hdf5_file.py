@@ -52,6 +52,11 @@ def _table(content: Any, what: str) -> MeasuredPoints:
     for name in ("x", "y", "height", "uncertainty", "sample"):
         if name in content:
             column[name] = _array(content[name], what, 1)
+    if gone := {"x", "y", "height"} - set(column):
+        raise FileError(f"{what} has no column {min(gone)!r}; write it again")
+    lengths = {name: len(values) for name, values in column.items()}
+    if len(set(lengths.values())) > 1:
+        raise FileError(f"{what} has columns of different lengths {lengths}; write it again")
     return measured(
         column["x"],
         column["y"],

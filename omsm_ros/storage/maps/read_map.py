@@ -67,11 +67,12 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         # Their layout fixes what they count in: nothing can contradict it.
         unasked = (NOT_USED,) if units else ()
         return replace(found, notes=(*found.notes, *unasked))
-    if b"\0" in head or path.suffix.lower() not in _TEXT_SUFFIXES:
-        return read_foreign(path, units)
-    if path.suffix.lower() in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
+    text, suffix = b"\0" not in head, path.suffix.lower()
+    if text and suffix in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
         return read_grid_sag(path, units).points()
-    return read_columns(path, units)
+    if text and suffix in _TEXT_SUFFIXES:
+        return read_columns(path, units)
+    return read_foreign(path, units)
 
 
 def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
