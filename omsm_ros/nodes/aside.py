@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import queue
 import threading
 from collections.abc import Awaitable, Callable
@@ -81,8 +80,9 @@ class Aside:
             try:
                 task = self._work.get(timeout=patience)
             except queue.Empty:
-                gc.collect()  # of what failed, the traceback holds all
-                give_back()  # or a node has for good the memory of its largest request
+                # Or a node has for good the memory of its largest request; the traceback of one
+                # that failed holds all of it.
+                give_back()
                 patience = None
                 continue
             if task is None:

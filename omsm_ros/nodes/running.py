@@ -28,6 +28,7 @@ from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_li
 from omsm_ros.loading import nothing_to_undo
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
+from omsm_ros.nodes.memory import keep_for_good
 from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
 from omsm_ros.storage import strict_json, strict_yaml
@@ -54,6 +55,7 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
         ending = _Ending()  # after rclpy, which puts back the handlers of the system
         node = make_node()
         node.start()
+        keep_for_good()
     except Exception as err:
         _give_up(node, err)
     try:

@@ -1,9 +1,11 @@
 """Memory that was freed goes back to the system, also from below what is still in use."""
 
 import ctypes
+import gc
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -55,12 +57,53 @@ if not again:
 print(os.getpid(), sys.argv[1:], os.environ.get("GLIBC_TUNABLES"), flush=True)
 memory.share_one_pool([signal.SIGUSR1])
 """
+# As a node keeps what it loaded: what refers to itself alone is gone, now and later.
+KEPT = """
+import gc
+from omsm_ros.nodes import memory
+from nodes.test_memory import lost_cycle
+
+gc.disable()
+early = lost_cycle()
+memory.keep_for_good()
+print(early() is None, gc.get_freeze_count() > 1000, len(gc.get_objects()) < 100)
+late = lost_cycle()
+memory.give_back()
+print(late() is None)
+"""
 glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
 
 
 def held_kib():
     (line,) = (t for t in Path("/proc/self/status").read_text().splitlines() if "RssAnon" in t)
     return int(line.split()[1])
+
+
+class Cycle:
+    """What refers to itself."""
+
+    def __init__(self):
+        self.itself = self
+
+
+def lost_cycle():
+    """A weak reference to a cycle that nothing else refers to."""
+    return weakref.ref(Cycle())
+
+
+def test_cycles_that_nothing_refers_to_are_given_back():
+    gc.disable()
+    try:
+        cycle = lost_cycle()
+        assert cycle() is not None
+        give_back()
+        assert cycle() is None
+    finally:
+        gc.enable()
+
+
+def test_what_a_node_loaded_is_looked_through_no_more():
+    assert said(KEPT) == ["True True True", "True"]
 
 
 @glibc
