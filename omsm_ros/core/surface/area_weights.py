@@ -5,7 +5,8 @@ it covers, ``r |Δθ|``, whatever the speed was and however many points beside i
 of equal area and a few turns counts alike, whatever the feed was while it was crossed, and one that
 was seen in part, as at the rim of a part beside the spindle's axis, by that part. On a single line
 a point stands for the way from half-way to the one before to half-way to the one after. Elsewhere,
-as on a raster, a point stands for what lies nearer to it than to any other.
+as on a raster or where points come in no order, a point stands for what lies nearer to it than to
+any other.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from omsm_ros.quantities import MAP_SPACING
 
 # A raster passes the axis now on this side, now on that, and never gets around it twice.
 _LEAST_TURNS = 2.0
+# Points in no order may, by chance: as many of their steps go back as go on. Of a path whose steps
+# are as wide as gaps, so many go on.
+_LEAST_ONWARD = 2 / 3
 # Rings so fine that the rim is a thousandth of the area, of whole turns and points enough for a
 # mean.
 _MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
@@ -47,7 +51,7 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
         weights = _ways(along)
         return np.asarray(weights / np.mean(weights), np.float64)
     angle = np.unwrap(np.arctan2(y, x))
-    turned = _turns(angle)
+    turned = _turns(angle) if _is_path(angle) else 0.0
     share = np.ones(len(x))
     if turned >= _LEAST_TURNS:
         group, area = _rings(x, y, turned)
@@ -79,7 +83,7 @@ def _ways(along: FloatArray) -> FloatArray:
     """Return the way (n,) that each point stands for [m]; across a gap nobody has looked."""
     order = np.argsort(along, kind="stable")
     steps = np.diff(along[order])
-    steps = np.minimum(steps, _MOST_STEPS * float(np.median(steps[steps > 0])))
+    steps = np.minimum(steps, _MOST_STEPS * _usual(steps))
     ways = np.empty(len(along))
     ways[order] = (np.r_[0.0, steps] + np.r_[steps, 0.0]) / 2
     return ways
@@ -87,6 +91,21 @@ def _ways(along: FloatArray) -> FloatArray:
 
 def _turns(angle: FloatArray) -> float:
     return float(abs(angle[-1] - angle[0]) / (2 * np.pi)) if len(angle) else 0.0
+
+
+def _is_path(angle: FloatArray) -> bool:
+    """Return whether the points follow each other about the origin, or come in no order."""
+    steps = np.diff(angle)
+    moved = steps[steps != 0]
+    if not len(moved) or _usual(np.abs(moved)) <= _LARGEST_ARC:
+        return True
+    onward = float(np.mean(moved > 0))
+    return max(onward, 1 - onward) >= _LEAST_ONWARD
+
+
+def _usual(steps: FloatArray) -> float:
+    """Return the median of the steps; where the path rests, or a point is told again, is none."""
+    return float(np.median(steps[steps > 0]))
 
 
 def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, FloatArray]:
@@ -102,9 +121,7 @@ def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, Float
 def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
     """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
     steps = np.abs(np.diff(angle))
-    # Where the path rests, or a point is told again, there is no step.
-    usual = float(np.median(steps[steps > 0]))
-    steps = np.minimum(steps, min(_MOST_STEPS * usual, _LARGEST_ARC))
+    steps = np.minimum(steps, min(_MOST_STEPS * _usual(steps), _LARGEST_ARC))
     covered = np.empty(len(angle))
     covered[0], covered[-1] = steps[0], steps[-1]
     covered[1:-1] = (steps[1:] + steps[:-1]) / 2

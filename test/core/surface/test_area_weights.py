@@ -200,3 +200,107 @@ def test_places_that_are_one_but_for_their_last_bits_weigh_alike() -> None:
     rng = np.random.default_rng(1)
     x, y = rng.integers(0, 9, (2, 500)) * 5e-324
     assert np.mean(area_weights(x, y)) == pytest.approx(1.0)
+
+
+# Single lines.
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6, np.pi / 2, 3.0])
+def test_on_a_line_a_point_stands_for_half_the_way_to_each_neighbour(turn: float) -> None:
+    """By hand, in any order and any direction; at its ends for half a step alone."""
+    along = np.array([0.0, 1.0, 3.0, 4.0, 4.5, 8.0]) * 1e-3
+    by_hand = np.array([0.5, 1.5, 1.5, 0.75, 2.0, 1.75])
+    order = np.array([3, 0, 5, 1, 4, 2])
+    x, y = np.cos(turn) * along[order] + 2e-3, np.sin(turn) * along[order] - 1e-3
+    np.testing.assert_allclose(area_weights(x, y), (by_hand / by_hand.mean())[order], rtol=1e-9)
+
+
+def test_across_a_gap_of_a_line_nobody_has_looked() -> None:
+    """A gap counts no more than ten of the usual steps."""
+    along = np.r_[np.arange(20.0), np.arange(20.0) + 1000.0] * 1e-4
+    weights = area_weights(along, np.zeros(40))
+    ways = np.ones(40)
+    ways[[0, -1]], ways[[19, 20]] = 0.5, 0.5 + 10 / 2
+    np.testing.assert_allclose(weights, ways / ways.mean(), rtol=1e-9)
+
+
+def test_two_points_share_their_line() -> None:
+    np.testing.assert_allclose(area_weights(np.array([0.0, 1e-3]), np.zeros(2)), [1.0, 1.0])
+
+
+def test_a_line_scanned_to_and_fro_has_the_integral_of_one_way() -> None:
+    there = np.linspace(-1.0, 1.0, 501)
+    along = np.concatenate([there, there[::-1][1:] + 1e-4])
+    weights = area_weights(RADIUS * along, 0 * along)
+    assert np.average(along**2, weights=weights) == pytest.approx(1 / 3, rel=1e-2)
+
+
+# Whatever the frame.
+
+
+@pytest.mark.parametrize("path", [lambda: spiral(9000, 30.0), raster])
+@pytest.mark.parametrize("scale", [1e-3, 50.0])
+def test_weights_do_not_depend_on_the_size_of_the_part(path, scale: float) -> None:
+    x, y = path()
+    np.testing.assert_allclose(area_weights(scale * x, scale * y), area_weights(x, y), rtol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.2, 1.0, -2.5])
+def test_a_turned_or_mirrored_spiral_weighs_as_before(turn: float) -> None:
+    x, y = spiral(9000, 30.0)
+    c, s = np.cos(turn), np.sin(turn)
+    np.testing.assert_allclose(
+        area_weights(c * x - s * y, s * x + c * y), area_weights(x, y), rtol=1e-6
+    )
+    np.testing.assert_allclose(area_weights(x, -y), area_weights(x, y), rtol=1e-6)
+
+
+def test_scanned_outwards_each_point_weighs_what_it_does_inwards() -> None:
+    x, y = spiral(9000, 30.0)
+    np.testing.assert_allclose(area_weights(x[::-1], y[::-1])[::-1], area_weights(x, y), rtol=1e-6)
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.5 * RADIUS, 0.9 * RADIUS])
+def test_a_raster_in_no_order_weighs_the_square_all_the_same(centre: float) -> None:
+    """By chance its points get around the axis some dozen times."""
+    x, y = raster(40, centre=centre)
+    order = np.random.default_rng(2).permutation(len(x))
+    assert turns(x[order], y[order]) > 2
+    np.testing.assert_allclose(area_weights(x[order], y[order]), area_weights(x, y)[order])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_dense_on_one_side_and_in_no_order_weigh_the_disc_as_it_is(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y = polar(RADIUS * np.sqrt(rng.random(30_000)), rng.uniform(-np.pi, np.pi, 30_000))
+    kept = (x < 0) | (rng.random(30_000) < 0.3)
+    x, y = x[kept], y[kept]
+    weights = area_weights(x, y)
+    assert np.mean(x) < -0.2 * RADIUS
+    assert abs(np.average(x, weights=weights)) < 0.05 * RADIUS
+
+
+@pytest.mark.parametrize("per_turn", [5.3, 8.1, 20.7])
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_spiral_of_few_points_a_turn_turns_all_the_same(per_turn: float, way: int) -> None:
+    x, y = spiral(4000, 4000 / per_turn)
+    weights = area_weights(x, way * y)
+    assert np.average(x**2, weights=weights) == pytest.approx(RADIUS**2 / 4, rel=0.04)
+
+
+def test_points_of_an_even_grid_weigh_alike_whatever_their_order_says() -> None:
+    x, y = spiral(500, 5.0)
+    np.testing.assert_array_equal(area_weights(x, y, even=True), np.ones(500))
+
+
+def test_on_one_circle_all_points_weigh_alike_but_those_beside_a_gap() -> None:
+    angle = np.linspace(0, 6 * np.pi, 3001)
+    weights = area_weights(*polar(np.full(3001, RADIUS), angle))
+    np.testing.assert_allclose(weights, np.ones(3001), rtol=1e-6)
+
+
+def test_a_path_that_turns_backwards_turns_as_often() -> None:
+    x, y = spiral(9000, 30.0)
+    assert turns(x, -y) == pytest.approx(turns(x, y))
+    assert turns(np.empty(0), np.empty(0)) == 0.0
+    assert turns(np.ones(3), np.zeros(3)) == 0.0
