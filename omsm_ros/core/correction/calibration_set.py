@@ -153,8 +153,7 @@ def _certificate(middle: Calibration, members: Sequence[Calibration]) -> dict[st
         if known:
             found[key] = max(known)
     gains = [c.static_gain for c in members]
-    stated = [c.certificate.get("static_gain_uncertainty", 0.0) for c in members]
-    own = max(float(size) for size in stated if isinstance(size, int | float))
+    own = max(c.static_gain_uncertainty for c in members)
     found["static_gain_uncertainty"] = float(np.hypot(own, np.ptp(gains) / np.sqrt(12.0)))
     found[ENTRY] = _latency(members).entry()
     return found

@@ -88,7 +88,7 @@ class ErrorSources:
         """
         return cls(
             probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
-            static_gain=_standard_uncertainty(calibration.certificate, "static_gain_uncertainty"),
+            static_gain=calibration.static_gain_uncertainty,
             motion_error=_standard_uncertainty(calibration.certificate, "motion_error_m"),
             lateral_lag=latency_of(calibration).beside_z_s,
         )

@@ -16,7 +16,7 @@ from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, OmsmError
-from omsm_ros.quantities import FREQUENCY, GAIN, SAMPLE_PERIOD
+from omsm_ros.quantities import FREQUENCY, GAIN, GAIN_UNCERTAINTY, SAMPLE_PERIOD
 from omsm_ros.units import NANOSECONDS_PER_S
 
 SCHEMA = "omsm-calibration/1"
@@ -70,6 +70,16 @@ class Calibration:
             raise CalibrationError(
                 f"G_m is unstable: poles {self.dynamics.poles()!r} rad/s; identify it again"
             )
+
+    @property
+    def static_gain_uncertainty(self) -> float:
+        """Standard uncertainty of the static gain [1], 0 where the certificate states none.
+
+        Raises CalibrationError where what it states is none.
+        """
+        name = "static_gain_uncertainty"
+        stated = self.certificate.get(name, 0.0)
+        return float(GAIN_UNCERTAINTY.checked(stated, CalibrationError, name))
 
     @property
     def low_frequency_delay_uncertainty(self) -> float:

@@ -7,7 +7,7 @@ same, or changed by so much at so many sigma.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +75,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
     covariance = response_covariance(old, lines) + response_covariance(new, lines)
     statistic, known = mahalanobis(difference, covariance)
     gain_change = new.static_gain / old.static_gain - 1
-    gain_sigma = math.hypot(*(gain_uncertainty(c.certificate) for c in (old, new)))
+    gain_sigma = math.hypot(*(c.static_gain_uncertainty for c in (old, new)))
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
     p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
@@ -124,9 +124,3 @@ def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, 
     known = values > _RANK_TOLERANCE * values[-1]
     along = vectors[:, known].T @ (difference / scale)
     return float(np.sum(along**2 / values[known])), int(np.sum(known))
-
-
-def gain_uncertainty(certificate: Mapping[str, object]) -> float:
-    """Return the standard uncertainty of the static gain [1], 0 where none is stated."""
-    value = certificate.get("static_gain_uncertainty", 0.0)
-    return float(value) if isinstance(value, (int, float)) else 0.0

@@ -13,7 +13,6 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.verification.change import (
     SIGNIFICANCE,
     common_lines,
-    gain_uncertainty,
     mahalanobis,
     response_covariance,
 )
@@ -95,7 +94,7 @@ def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
     )
     static_gain = _spread(
         [c.static_gain for c in calibrations],
-        [gain_uncertainty(c.certificate) for c in calibrations],
+        [c.static_gain_uncertainty for c in calibrations],
     )
     p_value = _chance(off, covariance, static_gain)
     k = len(lines)

@@ -63,8 +63,7 @@ def after_step_test(calibration: Calibration) -> Prior:
     jacobian = slow_motion_jacobian(calibration.dynamics)
     covariance = np.zeros((DYNAMIC, DYNAMIC))
     covariance[:GAIN, :GAIN] = jacobian @ calibration.covariance @ jacobian.T
-    stated = calibration.certificate.get("static_gain_uncertainty", 0.0)
-    relative = float(stated) / calibration.static_gain  # type: ignore[arg-type]
+    relative = calibration.static_gain_uncertainty / calibration.static_gain
     covariance[GAIN, GAIN] = relative**2
     covariance[LATENCY, LATENCY] = WIDE_S**2
     return Prior(covariance)
