@@ -3,7 +3,7 @@
 Without ``--full`` there are fewer runs of each study, so wider bars; each line says how many.
 Parts that judge results share the processors; those that take times follow, one after the other.
 
-Ends with exit status 1 if a bar is not cleared.
+Ends with exit status 1 if a bar is not cleared. Ended by a signal, it ends all that it has started.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import sys
 from pathlib import Path
 
+from benchmarks.ending import nothing_left
 from benchmarks.parts import PARTS, measured
 from benchmarks.row import Row
 
@@ -41,11 +42,12 @@ def main() -> int:
         parser.error(f"no part {unknown}, expected {', '.join(PARTS)}")
     found: list[Row] = []
     print(f"{'':6}{'figure':72}{'runs':>5}{'value':>12} {'':6}{'bar':16}peer")
-    for part, rows, wall, processor in measured(args.parts, args.full):
-        for row in rows:
-            show(row)
-        found += rows
-        print(f"      {part}: {wall:.0f} s, {processor:.0f} s of processor time", flush=True)
+    with nothing_left():
+        for part, rows, wall, processor in measured(args.parts, args.full):
+            for row in rows:
+                show(row)
+            found += rows
+            print(f"      {part}: {wall:.0f} s, {processor:.0f} s of processor time", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     # JSON has no NaN: what could not be had is null.
     plain = [{k: None if v != v else v for k, v in row.items()} for row in found]

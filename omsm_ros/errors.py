@@ -20,6 +20,13 @@ them into one line on stderr and exit status 2::
 Each text names the offending value and the remedy.
 """
 
+import errno
+import math
+import os
+import re
+import resource
+from collections.abc import Iterator
+
 
 class OmsmError(Exception):
     """Base of all deliberate errors of this package."""
@@ -80,23 +87,72 @@ DEBUG = "OMSM_DEBUG"
 """Environment variable that, when set, shows the traceback of a defect."""
 
 
-_LONGEST_LINE = 1500
+_LONGEST_LINE, _LONGEST_NAME = 1500, 160
+# What stands in quotes, or is one word without any: a path, an argument.
+_NAME = re.compile(r"""(?<!\w)(['"])(?:\\.|[^\\])*?\1(?!\w)|[^\s'"]+""")
 
 
 def one_line(text: object) -> str:
     """Return what an error says in one line that has an end: its middle goes, not the remedy.
 
-    Names and words in it come from outside: they may have any length, and what would steer a
-    terminal is written out.
+    Names and words in it come from outside: they may have any length, of which the beginning and
+    the end are kept, and what would steer a terminal is written out.
     """
-    line = printable(" ".join(str(text).split()))
-    half = _LONGEST_LINE // 2
-    return line if len(line) <= _LONGEST_LINE else f"{line[:half]} … {line[-half:]}"
+    # First to where searching it for names takes no time.
+    line = shortened(printable(" ".join(str(text).split())), 4 * _LONGEST_LINE)
+    line = _NAME.sub(lambda name: shortened(name[0], _LONGEST_NAME), line)
+    return shortened(line, _LONGEST_LINE)
+
+
+def shortened(text: str, most: int) -> str:
+    """Return ``text`` in ``most`` characters, its middle left out where it has more."""
+    if len(text) <= most:
+        return text
+    end = (most - 1) // 2
+    return f"{text[: most - 1 - end]}…{text[-end:]}"
 
 
 def printable(text: str) -> str:
     """Return ``text`` with all that would steer a terminal, ends of lines too, written out."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def too_many_open_files(err: BaseException) -> str:
+    """Return one line about the limit of open files, if it is behind ``err``; empty if it is not.
+
+    A library, or a part of one that cannot be loaded, tells of it in words alone.
+    """
+    words = os.strerror(errno.EMFILE)
+    for cause in _causes(err):
+        number = cause.errno if isinstance(cause, OSError) else None
+        if number in (errno.EMFILE, errno.ENFILE) or (
+            isinstance(cause, ImportError | RuntimeError) and words in str(cause)
+        ):
+            return f"too many open files: a process may hold {open_files()} here; {MORE_FILES}"
+    return ""
+
+
+MORE_FILES = "give it more with 'ulimit -n 1024' in this shell"
+"""What to do where the limit of open files is too low."""
+
+FEWEST_OPEN_FILES = 64
+"""A node of ROS 2 holds some twenty, a bag of many parts and a report as many again."""
+
+
+def open_files() -> float:
+    """Return how many files a process may hold open here; infinity where that is not limited."""
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return math.inf if most == resource.RLIM_INFINITY else most
+
+
+def _causes(err: BaseException) -> Iterator[BaseException]:
+    """Yield ``err`` and what it was raised from, or in the course of."""
+    known: set[int] = set()
+    found: BaseException | None = err
+    while found is not None and id(found) not in known:
+        known.add(id(found))
+        yield found
+        found = found.__cause__ or found.__context__
 
 
 def defect(err: BaseException) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.errors import DataError, OmsmError
+from omsm_ros.errors import DataError, OmsmError, shortened
 
 _SHOWN_CHARACTERS = 60
 
@@ -114,12 +114,12 @@ def _number(value: object, whole: bool) -> float | int | None:
 
 
 def shown(value: object) -> str:
-    """Return a foreign value as a message shows it: on one line, and short."""
+    """Return a foreign value as a message shows it: on one line, and short, with its end."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, a nest of lists
         text = f"a {type(value).__name__} too large to print"
-    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+    return shortened(text, _SHOWN_CHARACTERS)
 
 
 # Sampled data.

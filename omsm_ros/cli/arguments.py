@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.errors import ConfigurationError, FileError, one_line, shortened
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
 from omsm_ros.storage import strict_json
 from omsm_ros.storage.maps.length_units import LengthUnits, units_of
 from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
-_LONGEST_MESSAGE = 300
+_LONGEST_MESSAGE = 480
 
 
 class UsageError(ConfigurationError):
@@ -32,8 +32,7 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError instead of printing and exiting."""
         words = " ".join(filter(None, (self.prog, self.word)))
-        if len(message) > _LONGEST_MESSAGE:  # argparse repeats what it was given
-            message = f"{message[:_LONGEST_MESSAGE]}…"
+        message = shortened(one_line(message), _LONGEST_MESSAGE)  # it repeats what it was given
         raise UsageError(f"{message}; see '{words} --help'")
 
 

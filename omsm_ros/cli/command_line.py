@@ -20,7 +20,14 @@ from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
 from omsm_ros.cli.printing import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
-from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
+from omsm_ros.errors import (
+    DEBUG,
+    ConfigurationError,
+    OmsmError,
+    defect,
+    one_line,
+    too_many_open_files,
+)
 from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_json
 
@@ -160,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:
-        _complain(str(err))
+        _complain(too_many_open_files(err) or str(err))
         return BAD_INPUT
     except KeyboardInterrupt:
         _complain(INTERRUPTION)
@@ -190,6 +197,9 @@ def _make_writable() -> None:
 
 def _unforeseen(err: Exception) -> int:
     """Say what nobody foresaw; return the exit status."""
+    if short := too_many_open_files(err):
+        _complain(short)
+        return BAD_INPUT
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _OF_A_DISK):
         # Of a place that the system refuses: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))

@@ -11,7 +11,15 @@ from omsm_ros.emulators.players import emulated
 from omsm_ros.errors import OmsmError
 from omsm_ros.jobs.record_twin import NOMINAL, write_nominal
 from omsm_ros.storage.disturbance_file import load_disturbances
-from omsm_ros.storage.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC
+from omsm_ros.storage.files import (
+    CLOUD,
+    DEVIATION,
+    FORM,
+    REPORT,
+    SUMMARY,
+    SYSTEMATIC,
+    save_text,
+)
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, planned_test_of, spiral_of
 
@@ -147,15 +155,14 @@ class Demonstration:
         OmsmError if it holds anything, and is not the folder of a demonstration.
         """
         _ = self.disturbances  # a file that cannot be read is reported before anything is cleared
-        self.out.mkdir(parents=True, exist_ok=True)
         mark = self.out / _MARK
         # A scan and a calibration of a real machine have the same names.
-        if any(self.out.iterdir()) and not mark.is_file():
+        if self.out.is_dir() and any(self.out.iterdir()) and not mark.is_file():
             raise OmsmError(
                 f"{str(self.out)!r} holds files that no demonstration made; give a folder that is "
                 "empty or does not exist yet"
             )
-        mark.write_text("Whatever is in this folder, the next demonstration replaces.\n")
+        save_text(mark, "Whatever is in this folder, the next demonstration replaces.\n")
         stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
         for path in stale:
             if path.is_dir():

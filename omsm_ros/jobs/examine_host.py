@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from omsm_ros.devices.transport import serial_ports
+from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
 
 FINE, DOUBTFUL, FAULTY = "fine", "doubtful", "faulty"
 
@@ -56,6 +58,7 @@ def examine_host(folder: Path, port: str = "") -> list[Check]:
     return [
         _python(),
         *_packages(),
+        _open_files(),
         *_ros(os.environ),
         _serial(port),
         _clock(_kernel_clock_synchronised),
@@ -89,6 +92,15 @@ def _packages() -> Iterator[Check]:
         yield Check("optional packages", FINE, f"not installed: {use}")
 
 
+def _open_files() -> Check:
+    """Return whether a process may hold as many files as nodes and commands do."""
+    most = open_files()
+    if most >= FEWEST_OPEN_FILES:
+        return Check("open files", FINE, f"{most} at most" if most < math.inf else "any number")
+    found = f"a process may hold {most} open, and may need {FEWEST_OPEN_FILES}"
+    return Check("open files", FAULTY, found, MORE_FILES)
+
+
 def _ros(environment: os._Environ[str]) -> Iterator[Check]:
     """Yield whether nodes can start, and whether they find each other."""
     if importlib.util.find_spec("rclpy") is None:
@@ -116,6 +128,8 @@ def _ros(environment: os._Environ[str]) -> Iterator[Check]:
 
 def _discovery() -> Check:
     """Return whether two processes' worth of ROS find each other and pass a message."""
+    if open_files() < FEWEST_OPEN_FILES:
+        return Check("DDS discovery", FAULTY, "not evaluated: too few open files", MORE_FILES)
     command = [sys.executable, "-m", "omsm_ros.nodes.discovery_check"]
     try:
         done = subprocess.run(

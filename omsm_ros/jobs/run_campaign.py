@@ -26,7 +26,7 @@ from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.quantities import STAMP
 from omsm_ros.storage import bags, strict_json
 from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.files import SUMMARY, read_text, said, save_json
+from omsm_ros.storage.files import SUMMARY, make_folder, read_text, said, save_json
 from omsm_ros.storage.schemas import check_form, ranged
 from omsm_ros.storage.summary_file import read_summary
 
@@ -248,7 +248,7 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 def _alone(out: Path) -> Iterator[None]:
     """Hold the folder, so that two campaigns never write into it."""
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as err:
         raise FileError(

@@ -26,7 +26,14 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 from omsm_ros.emulators.players import EMULATED
-from omsm_ros.errors import DeviceTimeoutError, OmsmError, one_line
+from omsm_ros.errors import (
+    DEBUG,
+    DeviceTimeoutError,
+    OmsmError,
+    defect,
+    one_line,
+    too_many_open_files,
+)
 from omsm_ros.jobs.demonstrate import Demonstration, conclude, table_of
 from omsm_ros.nodes.processes import NodeProcesses
 from omsm_ros.seconds import beside, tick
@@ -262,8 +269,8 @@ def main() -> None:
         view=args.view,
     )
     stage = Stage(quiet=args.json)
-    rclpy.init()
     try:
+        rclpy.init()
         plan.prepare()
         with NodeProcesses(plan.out / "log") as processes:
             perform(DemoNode(processes), processes, plan, stage)
@@ -272,6 +279,12 @@ def main() -> None:
     except OmsmError as err:
         print(f"omsm demo: {one_line(err)}", file=sys.stderr)
         sys.exit(2)
+    except Exception as err:
+        short = too_many_open_files(err)
+        if os.environ.get(DEBUG) and not short:
+            raise
+        print(f"omsm demo: {short or defect(err)}", file=sys.stderr)
+        sys.exit(2 if short else 70)
     except KeyboardInterrupt:
         print("omsm demo: interrupted", file=sys.stderr)
         sys.exit(130)

@@ -24,7 +24,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from omsm_ros.errors import DEBUG, ConfigurationError, OmsmError, defect, one_line
+from omsm_ros.errors import (
+    DEBUG,
+    ConfigurationError,
+    OmsmError,
+    defect,
+    one_line,
+    too_many_open_files,
+)
 from omsm_ros.loading import nothing_to_undo
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
@@ -92,11 +99,13 @@ def _check_parameter_file(path: Path) -> None:
 
 
 def _give_up(node: ManagedNode | None, err: Exception) -> None:
-    known = isinstance(err, OmsmError)
+    short = too_many_open_files(err)
+    known = isinstance(err, OmsmError) or bool(short)
     if os.environ.get(DEBUG) and not known:
         raise err
     if node is None:
         text = f"{type(err).__name__}: {one_line(err)}" if known else defect(err)
+        text = short or text
         print(text, file=sys.stderr)
     else:  # the line is in the log already
         time.sleep(_LAST_WORDS_S if node.count_subscribers("/rosout") else 0.0)

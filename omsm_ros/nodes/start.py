@@ -15,6 +15,7 @@ import signal
 import sys
 from pathlib import Path
 
+from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
 from omsm_ros.loading import nothing_to_undo
 from omsm_ros.nodes.memory import share_one_pool
 
@@ -46,6 +47,7 @@ _NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
 def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
+    _check_open_files(name)
     with nothing_to_undo(ENDING):
         share_one_pool(ENDING)  # first, for the process may begin again
         end_with_launch()
@@ -58,6 +60,17 @@ def main() -> None:
                 sys.exit(_BAD_INPUT)
         node = importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node")
     node.main()
+
+
+def _check_open_files(name: str) -> None:
+    """End where ROS could not begin: short of files, it hangs, or ends without a word."""
+    if (most := open_files()) < FEWEST_OPEN_FILES:
+        print(
+            f"{name}: too few open files: a process may hold {most} here, and a node needs "
+            f"{FEWEST_OPEN_FILES}; {MORE_FILES}",
+            file=sys.stderr,
+        )
+        sys.exit(_BAD_INPUT)
 
 
 def end_with_launch() -> None:

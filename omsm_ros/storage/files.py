@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from omsm_ros.errors import FileError
+from omsm_ros.errors import FileError, shortened
 from omsm_ros.storage import strict_json
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
@@ -18,6 +18,9 @@ SYSTEMATIC = "systematic.npz"
 FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
 """The files of a measurement."""
 SPECTRUM, DIFFERENCE, EXPERIMENT = "spectrum.json", "difference.json", "experiment.json"
+
+# What says what is in the way of a file has room for it, and for the words around it.
+_LONGEST_NAME = 120
 
 
 def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
@@ -74,7 +77,7 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
     target = Path(path)
     part: Path | None = None
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         if target.exists() and not target.is_file():  # replacing /dev/null would break the machine
             raise FileExistsError(None, "it is a folder, a device or a pipe")
         part = beside(target)
@@ -90,6 +93,18 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
     finally:
         if part is not None:
             part.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; NotADirectoryError names the file that is in the way."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as err:
+        for above in (path, *path.parents):
+            if os.path.lexists(above):
+                name = shortened(repr(str(above)), _LONGEST_NAME)
+                raise NotADirectoryError(None, f"{name} is in the way, no folder") from err
+        raise
 
 
 def beside(target: Path) -> Path:

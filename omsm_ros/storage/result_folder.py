@@ -24,6 +24,7 @@ from omsm_ros.storage.files import (
     SUMMARY,
     SYSTEMATIC,
     beside,
+    make_folder,
     read_text,
     said,
 )
@@ -60,7 +61,7 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
     staged: Path | None = None
     try:
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(target.parent)
             if target.exists() and not target.is_dir():
                 raise NotADirectoryError(None, "it is a file; give a folder")
             _refuse_foreign(target, names)

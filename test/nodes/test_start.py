@@ -69,3 +69,60 @@ def test_transports_that_the_user_has_chosen_stay(monkeypatch):
     Path("DEFAULT_FASTRTPS_PROFILES.xml").touch()
     start.set_up_fast_dds()
     assert PROFILES not in os.environ
+
+
+def test_a_node_with_too_few_open_files_ends_in_one_line_before_ros_loads(monkeypatch, capsys):
+    monkeypatch.setattr(start, "open_files", lambda: 12)
+    monkeypatch.setattr(start, "share_one_pool", None)
+    monkeypatch.setattr(start.sys, "argv", ["/ws/install/lib/omsm_ros/corrector"])
+    with pytest.raises(SystemExit) as ended:
+        start.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert said.startswith("corrector: ")
+    assert said.count("\n") == 1
+    assert "may hold 12" in said
+    assert "ulimit -n" in said
+
+
+@pytest.mark.parametrize("most", [start.FEWEST_OPEN_FILES, float("inf")])
+def test_enough_open_files_are_passed_over(monkeypatch, most):
+    monkeypatch.setattr(start, "open_files", lambda: most)
+    start._check_open_files("corrector")
+
+
+@pytest.mark.parametrize(("package", "remedy"), [("rclpy", "env.sh"), ("omsm_msgs", "colcon")])
+def test_a_node_without_ros_or_messages_names_what_to_do(monkeypatch, capsys, package, remedy):
+    def absent(name, *_):
+        if name == package:
+            raise ImportError(f"No module named {name!r}")
+
+    for name in ("share_one_pool", "end_with_launch", "set_up_fast_dds"):
+        monkeypatch.setattr(start, name, lambda *_: None)
+    monkeypatch.setattr(start.importlib, "import_module", absent)
+    monkeypatch.setattr(start.sys, "argv", ["calibrator"])
+    with pytest.raises(SystemExit) as ended:
+        start.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert said.startswith(f"calibrator: No module named {package!r}: ")
+    assert said.count("\n") == 1
+    assert remedy in said
+
+
+def test_the_launch_that_is_gone_takes_its_node_with_it(monkeypatch):
+    gone = os.fork()
+    if gone == 0:
+        os._exit(0)
+    os.waitpid(gone, 0)
+    monkeypatch.setenv(start.LAUNCHED_BY, str(gone))
+    with pytest.raises(SystemExit, match="has ended"):
+        start.end_with_launch()
+    assert start.LAUNCHED_BY not in os.environ  # not for the children of the node
+    start.end_with_launch()  # of no launch
+
+
+def test_a_launch_that_is_no_parent_is_left_to_itself(monkeypatch):
+    monkeypatch.setenv(start.LAUNCHED_BY, str(os.getpid()))
+    monkeypatch.setattr(start.ctypes, "CDLL", None)
+    start.end_with_launch()

@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.storage import conversions
-from omsm_ros.storage.files import beside, said
+from omsm_ros.storage.files import beside, make_folder, said
 from omsm_ros.storage.message_types import bag_messages, typestore
 from omsm_ros.storage.recording.growing_file import GrowingFile
 from omsm_ros.storage.recording.topics import (
@@ -198,7 +198,7 @@ def whole_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
 def new_bag_file(path: Path) -> GrowingFile:
     """Make a file for a bag; BagError if there is one, or none can be made."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         return GrowingFile(path)
     except FileExistsError as err:
         raise _exists(path) from err
