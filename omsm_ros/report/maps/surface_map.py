@@ -61,9 +61,9 @@ def embedded(layers: Sequence[Layer]) -> EmbeddedMap:
         "missing": style.MISSING.lstrip("#"),
         "layers": [_entry(layer) for layer in layers],
     }
-    return EmbeddedMap(
-        json.dumps(content, separators=(",", ":")), tuple(layer.name for layer in layers)
-    )
+    # Within a script's tags nothing is unescaped, and a name could end them.
+    data = json.dumps(content, separators=(",", ":")).replace("<", r"\u003c")
+    return EmbeddedMap(data, tuple(layer.name for layer in layers))
 
 
 def script() -> str:
