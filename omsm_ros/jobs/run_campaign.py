@@ -141,6 +141,11 @@ def bags_below(folder: Path, out: Path) -> list[Path]:
     return sorted(found)
 
 
+def _is_bag(folder: Path) -> bool:
+    """Return whether a folder is a bag of its own, whose result has the folder's name."""
+    return (folder / "metadata.yaml").is_file()
+
+
 def load_campaign(out: Path) -> list[Entry]:
     """Return what an earlier run wrote down in ``out``, nothing where there was none."""
     path = out / STATE
@@ -206,7 +211,7 @@ def _task(
     bag: Path, folder: Path, calibration: Path, out: Path, options: Sequence[str], sign: list[str]
 ) -> Task:
     name = bag.relative_to(folder)
-    result = name.with_suffix("") if bag.is_file() else name
+    result = name.with_suffix("") if bag.is_file() and not _is_bag(bag.with_suffix("")) else name
     files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
     states = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     fingerprint = hashlib.sha256(repr((states, sign)).encode()).hexdigest()
