@@ -53,9 +53,6 @@ class TdmsTable(ForeignTable):
     def _damaged(self, err: Exception) -> FileError:
         return FileError(f"{self} cannot be read: {said(err)}; write it again, or as CSV")
 
-    def _damaged(self, err: Exception) -> FileError:
-        return FileError(f"{self} cannot be read: {said(err)}; write it again, or as CSV")
-
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]
     ) -> Iterator[dict[str, FloatArray]]:
