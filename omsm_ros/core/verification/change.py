@@ -38,7 +38,8 @@ class Change:
 
     delay: change of the low-frequency delay [s];  delay_sigmas: over its uncertainty
     gain_at, phase_at: largest change of gain [1] and phase [rad], at ``frequency`` [Hz]
-    static_gain, static_gain_sigmas: change of the probe's static gain [1], and over its own
+    static_gain, static_gain_sigmas: change of the probe's static gain, as a share of it [1], and
+        over its own
     p_value: of an unchanged machine showing at least this;  changed: verdict
     """
 
@@ -74,7 +75,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
     difference = np.concatenate([ratio.real, np.angle(np.exp(1j * ratio.imag))])
     covariance = response_covariance(old, lines) + response_covariance(new, lines)
     statistic, known = mahalanobis(difference, covariance)
-    gain_change = new.static_gain / old.static_gain - 1
+    gain_change = new.static_gain - old.static_gain
     gain_sigma = math.hypot(*(c.static_gain_uncertainty for c in (old, new)))
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
     p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
@@ -87,7 +88,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
         frequency=float(lines[worst]),
         gain_at=float(difference[worst]),
         phase_at=float(difference[_LINES + worst]),
-        static_gain=float(gain_change),
+        static_gain=float(gain_change / old.static_gain),
         static_gain_sigmas=float(gain_sigmas),
         p_value=p_value,
         changed=p_value < SIGNIFICANCE,
