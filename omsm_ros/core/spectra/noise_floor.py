@@ -15,6 +15,10 @@ _NARROWEST, _WIDEST = 12, 400
 _RELATIVE_WIDTH = 0.25
 # Evenly over the logarithm: in a million frequencies, 3.5 % apart.
 _BANDS = 400
+# Logarithm of a chance that is so small.
+_RARE = -30.0
+# No power at all has no logarithm.
+_LEAST_RATIO = 1e-15
 
 
 def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
@@ -48,11 +52,17 @@ def significance(ratio: FloatArray, tried: float) -> FloatArray:
     The probability that noise alone gives such a line anywhere, ``1 - (1 - exp(-ratio))^tried``,
     as the σ beyond which a normal variable lies with it, one-sided.
     """
-    chance = np.minimum(np.log(max(tried, 1.0)) - np.asarray(ratio, np.float64), 0.0)
-    log_any = np.where(chance > -1e-3, np.log1p(-np.exp(-1.0)), chance)
+    power, tried = np.asarray(ratio, np.float64), max(tried, 1.0)
+    # Where it is small it is the chance of one times their number, and rounding is larger.
+    small = np.log(tried) - power
+    none = tried * np.log1p(-np.exp(-np.clip(power, _LEAST_RATIO, np.log(tried) - _RARE)))
+    log_any = np.where(small < _RARE, small, np.log(-np.expm1(none)))
     return np.asarray(-special.ndtri_exp(log_any))
 
 
 def ratio_at(sigma: float, tried: float) -> float:
     """Return the ratio of powers whose significance is ``sigma``, the inverse of the above."""
-    return float(np.log(max(tried, 1.0)) - special.log_ndtr(-sigma))
+    tried, log_any = max(tried, 1.0), float(special.log_ndtr(-sigma))
+    if log_any < _RARE:
+        return float(np.log(tried)) - log_any
+    return -float(np.log(-np.expm1(special.log_ndtr(sigma) / tried)))
