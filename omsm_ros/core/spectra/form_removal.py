@@ -108,6 +108,12 @@ class FormFit:
             gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
             energy = float(np.sum(values[self._chosen] ** 2))
             degree = _enough(basis, gram, moment, energy, worth)
+            # Of what that leaves, for rounding of millimetres would look like form of its own.
+            solution = _solved(gram, moment, basis.within(degree))
+            left = values - _evaluated(basis.up_to(degree), self._signal, solution)
+            _, moment = _normal_equations(basis, self._signal, left, self._chosen)
+            energy = float(np.sum(left[self._chosen] ** 2))
+            degree = _beyond(basis, gram, moment, energy, worth, degree)
             if degree < top:
                 break
         return degree
@@ -191,6 +197,10 @@ class _Basis:
         kept = tuple(name for name in self.names if self.degree(name) <= degree)
         return replace(self, names=kept)
 
+    def within(self, degree: int) -> np.ndarray:
+        """Return the places of the columns that a fit of ``degree`` has, (q,)."""
+        return np.flatnonzero([self.degree(name) <= degree for name in self.names])
+
     def degree(self, name: tuple[str, int, int]) -> int:
         """Return the degree from which on the fit has a column; without turns, of time."""
         kind, n, _ = name
@@ -260,16 +270,33 @@ def _enough(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
 ) -> int:
     """Return the degree beyond which nothing worth it is taken away."""
-    needed = np.array([basis.degree(name) for name in basis.names])
+    highest = max(map(basis.degree, basis.names))
     left, kept = energy, 0
-    for degree in (d for d in _DEGREES if d <= needed.max()):
-        columns = np.flatnonzero(needed <= degree)
+    for degree in (d for d in _DEGREES if d <= highest):
+        columns = basis.within(degree)
         solution = _solved(gram, moment, columns)
         now = energy - float(solution @ moment[columns])
         if degree > _DEGREES[0] and now > (1 - worth) * left:
             break
         left, kept = now, degree
     return kept
+
+
+def _beyond(
+    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float, degree: int
+) -> int:
+    """Return a higher degree that is worth all those up to it, ``degree`` if none is.
+
+    Six lobes are nothing to the fourth degree, and all to the sixth.
+    """
+    highest = max(map(basis.degree, basis.names))
+    left = energy
+    for higher in (d for d in _DEGREES if degree < d <= highest):
+        columns = basis.within(higher)
+        now = energy - float(_solved(gram, moment, columns) @ moment[columns])
+        if now <= (1 - worth) ** ((higher - degree) // _DEGREES.step) * left:
+            left, degree = now, higher
+    return degree
 
 
 def _solved(gram: FloatArray, moment: FloatArray, columns: np.ndarray) -> FloatArray:
