@@ -14,7 +14,6 @@ from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.samples.foreign_columns import (
     AXES,
     COUNTING,
-    DATE,
     MOST_PERIOD_ERROR,
     PROBE,
     ColumnMap,
@@ -23,6 +22,7 @@ from omsm_ros.core.samples.foreign_columns import (
     distance_blocks,
     in_step,
 )
+from omsm_ros.core.samples.foreign_units import DATE
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.jobs.foreign_rows import Origin, RowCounter
 from omsm_ros.jobs.progress import Progress, no_progress
@@ -99,6 +99,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
                 bag.write_distance(block)
             done += len(block)
             progress(done, 0)
+        _check_counted(streams)
 
 
 def _check_streams(
@@ -106,16 +107,28 @@ def _check_streams(
 ) -> None:
     """Raise FileError unless each stream is whole and comes from files of one kind."""
     for channel in mapped.columns:
-        if not mapped.has(channel) or channel in COUNTING:
+        if not mapped.has(channel):
             continue
         holders, name = [c for c in chains if channel in c], mapped.columns[channel].name
         if not holders:
             raise FileError("; ".join(source.without(name, channel) for source in sources))
-        if len(holders) > 1:
+        if len(holders) > 1 and channel not in COUNTING:
             raise FileError(
                 f"files with different columns have the column {name!r} of {channel}; import them "
                 "one by one, or leave out those that only repeat it"
             )
+
+
+def _check_counted(streams: Sequence[_Stream]) -> None:
+    """Raise FileError where triggers are missing in one stream, and another cannot show it."""
+    gaps = [s for s in streams if any(source.found.missing for source in s.sources)]
+    uncounted = [s for s in streams if not s.counted]
+    if gaps and uncounted:
+        raise FileError(
+            f"{gaps[0].sources[0].found.file} lacks triggers, and "
+            f"{uncounted[0].sources[0].found.file} has no column that tells which rows belong to "
+            "the others; give it the trigger or the time, too"
+        )
 
 
 @contextmanager
@@ -134,6 +147,7 @@ class _Stream:
         self.sources = sources
         channels = sources[0].channels
         self.triggered = "trigger" in channels
+        self.counted = bool({*COUNTING} & {*channels})
         self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
         first = sources[0].first()
         with _told_of(sources[0].found.file):
@@ -178,6 +192,7 @@ class _Source:
                 f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together: "
                 "give them in one file"
             )
+        table.used(mapped.names(self.channels))
         self._check_units()
         self._check_period()
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.core.samples.foreign_columns import CHANNELS, COUNT, UNITS, Column, ColumnMap
+from omsm_ros.core.samples.foreign_columns import CHANNELS, Column, ColumnMap
+from omsm_ros.core.samples.foreign_units import COUNT, UNITS
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.storage import strict_yaml
@@ -31,7 +32,7 @@ _MAP = form(
         "invalid": {"type": "array", "items": {"anyOf": [NUMBER, _TEXT]}, "maxItems": 100},
         "delimiter": {"type": "string", "minLength": 1, "maxLength": 1},
         "decimal": {"enum": [".", ","]},
-        "zone": {"type": "string", "pattern": r"^(Z|[+-]\d\d:\d\d)$"},
+        "zone": {"type": "string", "pattern": r"^(Z|[+-](0\d|1[0-4]):[0-5]\d)$"},
         "lines_before_names": _LINES,
         "lines_after_names": _LINES,
     },

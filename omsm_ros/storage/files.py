@@ -23,6 +23,10 @@ SPECTRUM, DIFFERENCE, EXPERIMENT = "spectrum.json", "difference.json", "experime
 _LONGEST_NAME = 120
 
 
+# What libraries raise of files that they take for whole; the words are those of their own code.
+_OF_A_LIBRARY = (LookupError, TypeError, AttributeError, RecursionError, AssertionError)
+
+
 def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
     """Return the text of a regular file of at most ``limit`` bytes.
 
@@ -63,6 +67,10 @@ def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[byte
 
 def said(err: Exception) -> str:
     """Return what an exception says, on one line, without the path that a message names."""
+    if isinstance(err, MemoryError):
+        return "it asks for more memory than there is"
+    if isinstance(err, _OF_A_LIBRARY):
+        return "what it holds does not fit together"
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
     return " ".join(text.split())[:200] or type(err).__name__
 

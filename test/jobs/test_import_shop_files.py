@@ -207,6 +207,9 @@ def test_what_is_no_text_is_told_what_it_is(read, data, said):
         (["11/21/2026 2:03:05 PM,1"], "", "ISO 8601"),
         (["45982.58,1"], "", "ISO 8601"),
         (["2026-13-41T14:03:05Z,1"], "", "line 2"),
+        (["2026-11-21T14:03:05+25:00,1"], "", "ISO 8601"),
+        # 2**64 ns after 2026-11-21: 64 bits of nanoseconds would call it that day.
+        (["2611-06-11T13:37:38.709Z,1"], "", "from 1700-01-01 to 2261-12-31"),
         (["2026-11-21T14:03:05Z,1"], "zone: Z\n", "leave zone out"),
         (["2026-11-21T14:03:05Z,1"] * 3, "", "too coarsely"),
         (["2026-11-21T14:03:05Z,1", "2026-11-21T14:03:06Z,2"], "start: 5\n", "leave start out"),
@@ -216,12 +219,24 @@ def test_a_date_that_says_not_when_is_refused(read, rows, more, said):
     assert said in refusal(read, "\n".join(["t,d", *rows]), DATED + more)
 
 
-@pytest.mark.parametrize("name", ["d [mm]", "d (mm)", "d/mm"])
+@pytest.mark.parametrize("name", ["d [mm]", "d (mm)", "d/mm", "d_mm", "d mm", "d in mm"])
 def test_a_unit_that_the_file_contradicts_is_refused(read, name):
     mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: '{name}', unit: um}}\n"
     assert "in mm, the map in um" in refusal(read, f"{name}\n1\n2\n", mapping)
     stated = mapping.replace("unit: um", "unit: count, count: 1e-6")
     assert read(f"{name}\n1\n2\n", stated) == pytest.approx([1, 2])
+
+
+@pytest.mark.parametrize("unit", ["V", "mV", "Å", "counts", "in", "deg"])
+def test_a_unit_that_no_map_could_name_is_not_overruled_either(read, unit):
+    mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: 'd [{unit}]', unit: um}}\n"
+    assert f"in {unit}, the map in um" in refusal(read, f"d [{unit}]\n1\n2\n", mapping)
+
+
+@pytest.mark.parametrize("name", ["d [um]", "d [μm]", "d [micron]", "d_um", "d [slide]", "y_in"])
+def test_other_words_for_the_same_unit_and_words_that_are_none_are_read(read, name):
+    mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: '{name}', unit: um}}\n"
+    assert read(f"{name}\n1\n2\n", mapping) == pytest.approx([1, 2])
 
 
 @pytest.mark.parametrize("unit", ["mm", "[mm]", " (mm) ", '"mm"'])
@@ -232,6 +247,65 @@ def test_a_line_of_units_that_contradicts_the_map_is_refused(read, unit):
     assert "'d' in mm, the map in um" in refusal(read, words, PROBE + "lines_after_names: 2\n")
     fits = text.replace("mm", "um")
     assert read(fits, PROBE + "lines_after_names: 1\n") == pytest.approx([1, 2])
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"), [("'1'", "write unit: '%'"), ("count, count: 0.1", "of")]
+)
+def test_intensities_above_all_are_in_another_unit(read, unit, said):
+    mapping = PROBE + f"  intensity: {{name: p, unit: {unit}}}\n"
+    told = refusal(read, "d,p\n0,48\n1,52\n2,50\n", mapping)
+    assert "intensity is" in told
+    assert said in told
+    assert len(read("d,p\n0,48\n1,52\n2,50\n", mapping.replace(unit, "'%'"))) == 3
+
+
+@pytest.mark.parametrize("counting", ["trigger: {name: n}", "time: {name: n, unit: s}"])
+def test_a_count_that_no_file_has_is_asked_for(read, counting):
+    said = refusal(read, "i,d\n0,1\n1,2\n", PROBE + f"  {counting}\n")
+    assert "no column 'n' of" in said
+
+
+def turning(importer, values, unit):
+    """Import a spindle that reads ``values``."""
+    rows = ["c,z", *(f"{v:.6f},0" for v in values)]
+    (importer.folder / "c.csv").write_text("\n".join(rows))
+    still = "".join(f"  {a}: {{constant: 0}}\n" for a in "xyb")
+    c = f"  c: {{name: c, unit: {unit}}}\n  z: {{name: z, unit: mm}}\n"
+    return importer("sample_period: 0.001\ncolumns:\n" + still + c, "c.csv")
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("low", [0.0, -0.5])
+@pytest.mark.parametrize("counted", ["deg", "rad", "turn"])
+def test_a_spindle_that_falls_back_by_a_turn_shows_its_unit(importer, counted, low, way):
+    turn = {"deg": 360.0, "rad": 2 * np.pi, "turn": 1.0}
+    share = (way * np.arange(900) * 0.0021 - low) % 1.0 + low
+    for stated in turn:
+        if stated == counted:
+            assert turning(importer, share * turn[counted], stated)[0].rows == 900
+            importer.out.unlink()
+        else:
+            with pytest.raises(OmsmError, match=f"counted in {counted} does, the map says"):
+                turning(importer, share * turn[counted], stated)
+
+
+def test_a_spindle_that_goes_on_or_jumps_at_rest_shows_none(importer):
+    for values in (np.arange(900) * 0.72, np.repeat([0.0, 359.0, 0.0], 300)):
+        assert turning(importer, values, "rad")[0].rows == 900
+        importer.out.unlink()
+
+
+def test_gaps_of_triggers_beside_a_file_that_cannot_show_them_are_refused(importer):
+    (importer.folder / "z.csv").write_text("n,Z\n" + "".join(f"{n},0\n" for n in (0, 1, 3, 4)))
+    (importer.folder / "d.csv").write_text("d\n1\n2\n3\n4\n")
+    mapping = PROBE + "  trigger: {name: n}\n  z: {name: Z, unit: mm}\n"
+    mapping += "".join(f"  {a}: {{constant: 0}}\n" for a in "xybc")
+    with pytest.raises(OmsmError, match=r"z\.csv lacks triggers, and .*d\.csv has no column"):
+        importer(mapping, "z.csv", "d.csv")
+    assert not importer.out.exists()
+    (importer.folder / "z.csv").write_text("n,Z\n" + "".join(f"{n},0\n" for n in range(4)))
+    importer(mapping, "z.csv", "d.csv")
 
 
 def test_a_column_that_is_not_there_or_stands_twice_is_told_by_the_names_of_the_file(read):

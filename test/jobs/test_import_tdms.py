@@ -69,6 +69,7 @@ def test_segments_that_a_logger_appended_follow_each_other(importer, tdms_file):
     ("told", "said"),
     [
         ({"unit_string": "mm"}, "in mm, the map in um"),
+        ({"unit_string": "V"}, "in V, the map in um"),
         ({"wf_increment": 5e-4}, "sample period of 0.0005 s, the map 0.001 s"),
     ],
 )
@@ -88,4 +89,44 @@ def test_channels_of_different_lengths_are_refused(importer, tdms_file):
 def test_a_damaged_tdms_file_is_one_clear_error(importer, tdms_file, cut):
     tdms_file.write_bytes(tdms({"gap": np.arange(9.0)})[:cut])
     with pytest.raises(FileError, match=r"a\.tdms"):
+        importer(TDMS_MAP, "a.tdms")
+
+
+@pytest.mark.parametrize("key", ["wf_increment", "wf_start_offset"])
+def test_channels_that_were_not_sampled_together_are_refused(importer, tdms_file, key):
+    channels = {"gap": np.arange(9.0), "n": np.arange(9.0), "other": np.arange(9.0)}
+    told = {"gap": {key: 1e-3}, "n": {key: 2e-3}, "other": {key: 7e-3}}
+    tdms_file.write_bytes(tdms(channels, told))
+    with pytest.raises(FileError, match=f"{key} 0.001 of 'log/gap' and 0.002 of 'log/n'"):
+        importer(TDMS_MAP + "  trigger: {name: log/n}\n", "a.tdms")
+    importer(TDMS_MAP, "a.tdms")  # what is not read may be as it is
+
+
+SLOPE = {"NI_Number_Of_Scales": 1.0, "NI_Scale[0]_Linear_Slope": 2.0}
+SLOPE |= {"NI_Scale[0]_Scale_Type": "Linear", "NI_Scale[0]_Linear_Y_Intercept": 1.0}
+
+
+def test_a_scale_is_applied_and_one_that_is_not_known_is_not_left_out(importer, tdms_file):
+    scaled = SLOPE | {"NI_Scale[0]_Linear_Input_Source": float(0xFFFFFFFF)}
+    tdms_file.write_bytes(tdms({"gap": np.arange(9.0)}, {"gap": scaled}))
+    importer(TDMS_MAP, "a.tdms")
+    np.testing.assert_allclose(importer.blocks()[0].distance, (2 * np.arange(9) + 1) * 1e-6)
+    importer.out.unlink()
+    unknown = {"gap": scaled | {"NI_Scale[0]_Scale_Type": "Mystery"}}
+    tdms_file.write_bytes(tdms({"gap": np.arange(9.0), "raw": np.arange(9.0)}, unknown))
+    with pytest.raises(FileError, match="Unsupported scale type: Mystery"):
+        importer(TDMS_MAP, "a.tdms")
+    importer(TDMS_MAP.replace("gap", "raw"), "a.tdms")
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ({"NI_Number_Of_Scales": 1e6}, "is 1000000.0, expected at most 100"),
+        ({"NI_Number_Of_Scales": 50.0}, "does not fit together"),
+    ],
+)
+def test_scales_that_are_none_are_told_at_once(importer, tdms_file, spoilt, said):
+    tdms_file.write_bytes(tdms({"gap": np.arange(9.0)}, {"gap": SLOPE | spoilt}))
+    with pytest.raises(FileError, match=said):
         importer(TDMS_MAP, "a.tdms")

@@ -5,69 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from types import MappingProxyType
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
+from omsm_ros.core.samples.foreign_units import (
+    DATE,
+    SINCE_1970,
+    check_share,
+    check_turns,
+    is_other,
+)
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
-from omsm_ros.units import (
-    DEGREE_RAD,
-    MICROMETRE_M,
-    MICROSECOND_S,
-    MILLIMETRE_M,
-    MILLISECOND_S,
-    NANOMETRE_M,
-    NANOSECOND_S,
-    NANOSECONDS_PER_S,
-)
+from omsm_ros.units import NANOSECONDS_PER_S
 
 AXES = ("x", "y", "z", "b", "c")
 PROBE = ("distance", "intensity")
 COUNTING = ("trigger", "time")
 CHANNELS = (*AXES, *PROBE, *COUNTING)
-
-_LENGTHS = {
-    "m": 1.0,
-    "mm": MILLIMETRE_M,
-    "um": MICROMETRE_M,
-    "µm": MICROMETRE_M,
-    "nm": NANOMETRE_M,
-    "inch": 0.0254,
-}
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEGREE_RAD, "turn": 2 * np.pi}
-_TIMES = {
-    "s": 1.0,
-    "ms": MILLISECOND_S,
-    "us": MICROSECOND_S,
-    "µs": MICROSECOND_S,
-    "ns": NANOSECOND_S,
-}
-DATE = "date"
-"""The unit of instants that are no numbers in the file: dates in text, stamps of messages."""
-
-SINCE_1970 = {
-    "unix": 1.0,
-    "unix_ms": MILLISECOND_S,
-    "unix_us": MICROSECOND_S,
-    "unix_ns": NANOSECOND_S,
-}
-"""Units of times since 1970, and what one of them is in seconds."""
-
-UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
-    {
-        **dict.fromkeys(("x", "y", "z", "distance"), _LENGTHS),
-        **dict.fromkeys(("b", "c"), _ANGLES),
-        "intensity": {"1": 1.0, "%": 0.01},
-        "time": {**_TIMES, **SINCE_1970, DATE: 1.0},
-        "trigger": {"1": 1.0},
-    }
-)
-"""Units that a column of each channel may be in, and what one of them is in SI."""
-
-COUNT = "count"
-"""The unit of a raw reading: a column in it says what one count is in SI."""
 
 # 0.4 MB of axes in a message.
 _BLOCK_SAMPLES = 10_000
@@ -101,9 +57,7 @@ class Column:
 
     def contradicts(self, stated: str, channel: str) -> bool:
         """Return whether ``stated``, a file's own word on the unit, means another one."""
-        units = UNITS[channel]
-        known = stated in units and self.unit in units
-        return known and units[stated] != units[self.unit]
+        return is_other(stated, self.unit, channel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,6 +257,9 @@ def axis_blocks(
     table: Mapping[str, FloatArray], mapped: ColumnMap, rows: Rows
 ) -> Iterator[AxisBlock]:
     """Yield the axes of ``rows`` of ``table`` (column name → (n,)), cut at gaps of their count."""
+    for axis in ("b", "c"):
+        if mapped.has(axis):
+            check_turns(table[mapped.columns[axis].name], mapped.columns[axis].unit, axis)
     channels = {c: _channel(table, mapped.columns[c], len(rows.counter)) for c in AXES}
     for part, stamp_ns, first in rows.parts():
         yield AxisBlock(
@@ -327,6 +284,7 @@ def distance_blocks(
     intensity = np.empty(0, np.float32)
     if mapped.has("intensity"):
         read = _channel(table, mapped.columns["intensity"], count)
+        check_share(read, mapped.columns["intensity"].unit)
         intensity = INTENSITY_READING.or_lost(read).astype(np.float32)
     for part, stamp_ns, first in rows.parts():
         yield DistanceBlock(

@@ -13,8 +13,11 @@ from omsm_ros.units import NANOSECONDS_PER_S
 EXPECTED = "expected a date after ISO 8601, as 2026-11-21T14:03:05.125+01:00"
 
 _DATE = re.compile(
-    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)(?:[.,](\d{1,9}))?\s*(Z|[+-]\d\d(?::?\d\d)?)?"
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)(?:[.,](\d{1,9}))?\s*"
+    r"(Z|[+-](?:0\d|1[0-4])(?::?[0-5]\d)?)?"
 )
+# What 64 bits of nanoseconds hold; a later one would be another date.
+_FIRST_DAY, _LAST_DAY = "1700-01-01", "2261-12-31"
 
 
 def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
@@ -34,6 +37,8 @@ def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
             raise ValueError("the date has no time zone; write it into the map, as zone: '+01:00'")
         if stated and zone:
             raise ValueError("the date states its time zone; leave zone out of the map")
+        if not _FIRST_DAY <= day <= _LAST_DAY:
+            raise ValueError(f"expected a date from {_FIRST_DAY} to {_LAST_DAY}")
         days.append(f"{day}T{clock}" + (f".{fraction}" if fraction else ""))
         shifts.append(shift_of(stated or zone))
     since = np.array(days, "datetime64[ns]").astype(np.int64)

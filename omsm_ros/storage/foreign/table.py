@@ -10,13 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.foreign_units import DATE, UNITS
 from omsm_ros.errors import FileError
 
 MAX_ROWS = 200_000_000
 PIECE_ROWS = 100_000
 
 
-_IN_NAME = re.compile(r".*[\[(/]\s*([^\[\]()/\s]+)\s*[\])]?\s*")
+_IN_NAME = re.compile(r".*[\[(]\s*([^\[\]()/\s]+)\s*[\])]?\s*")
+# Without brackets a word may be no unit: log/V is a channel, y_in an input.
+_AFTER_NAME = re.compile(r".*[_\s/]([^\[\]()/\s_]+)\s*")
+
+
+_SURE = frozenset[str]().union(*UNITS.values()) - {DATE, "1"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +50,11 @@ class ForeignTable(ABC):
     repeated_names: lines met so far that repeat the line of names, and hold no numbers
     passed_over: messages met so far that hold none of the columns
     sample_period: that the file itself states [s], None if it does not
+    units_in_names: whether names of columns may hold units
     """
 
     sample_period: float | None = None
+    units_in_names = True
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -83,6 +91,9 @@ class ForeignTable(ABC):
     ) -> Iterator[dict[str, FloatArray]]:
         """Yield pieces of some rows."""
 
+    def used(self, names: Sequence[str]) -> None:  # noqa: B027
+        """Say that the columns ``names`` will be read; FileError where they do not fit together."""
+
     def close(self) -> None:
         """Let go of the file."""
         self._opened.close()
@@ -93,8 +104,12 @@ class ForeignTable(ABC):
 
 
 def stated_unit(table: ForeignTable, name: str) -> str:
-    """Return the unit that a file states of a column, as in "Z [mm]" too; empty if none."""
+    """Return the unit that a file states of a column, as in "Z [mm]" or z_mm too; empty if none."""
     if name in table.units:
         return table.units[name].strip()
-    found = _IN_NAME.fullmatch(name)
-    return found[1] if found else ""
+    if not table.units_in_names:
+        return ""
+    if found := _IN_NAME.fullmatch(name):
+        return found[1]
+    found = _AFTER_NAME.fullmatch(name)
+    return found[1] if found and found[1] in _SURE else ""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.foreign_columns import UNITS
+from omsm_ros.core.samples.foreign_units import WORDS
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import shown
 from omsm_ros.storage.files import open_regular
@@ -34,7 +34,6 @@ _NO_TEXT = {
     b"\x89HDF": "it is HDF5; name it .h5",
     b"\x89MCA": "it is a ROS bag; name it .mcap",
 }
-_UNITS = frozenset().union(*UNITS.values())
 _DELIMITERS = (";", "\t", ",", "|")
 # 1 234, 1'234 or 1,234.5, of which 1,234 alone may be a decimal comma; spaces may be narrow.
 _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)?|.*,.*\\..*")
@@ -120,6 +119,10 @@ class TextTable(ForeignTable):
 
     def _named_cells(self, line: str) -> list[str]:
         """Return the cells of the line of names, which alone may hold delimiters in quotes."""
+        if len(line) > _MAX_LINE_CHARACTERS:
+            raise FileError(
+                f"{self} has {len(line)} characters in a line; it is no table of numbers"
+            )
         cells = self._cells(line)
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
@@ -128,7 +131,7 @@ class TextTable(ForeignTable):
     def _stated_units(self, line: str) -> dict[str, str]:
         """Return the units that a line below the names holds, as mm, [mm] or (mm)."""
         cells = [cell.strip().strip("[]()").strip() for cell in self._named_cells(line)]
-        return {n: unit for n, unit in zip(self.names, cells, strict=False) if unit in _UNITS}
+        return {n: unit for n, unit in zip(self.names, cells, strict=False) if unit in WORDS}
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]
@@ -206,7 +209,7 @@ class TextTable(ForeignTable):
         try:
             rows.read_dates([line])
         except ValueError as err:
-            return str(err) if EXPECTED in str(err) or "zone" in str(err) else EXPECTED
+            return str(err) if "expected" in str(err) or "zone" in str(err) else EXPECTED
         if self._form.decimal == "," and "." in line:
             return "numbers with a decimal comma have no points; write thousands without them"
         return (

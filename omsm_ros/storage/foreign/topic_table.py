@@ -83,6 +83,8 @@ def _standard() -> Typestore:
 class TopicTable(ForeignTable):
     """The messages of one topic; a row each."""
 
+    units_in_names = False  # position[A] is a joint
+
     def __init__(self, bag: ForeignBag, topic: str) -> None:
         super().__init__(bag.path)
         self._bag, self._topic = bag, topic

@@ -1,0 +1,149 @@
+"""Units of another program's columns: which a map may name, and which a file shows by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.errors import DataError
+from omsm_ros.units import (
+    DEGREE_RAD,
+    MICROMETRE_M,
+    MICROSECOND_S,
+    MILLIMETRE_M,
+    MILLISECOND_S,
+    NANOMETRE_M,
+    NANOSECOND_S,
+)
+
+_INCH_M = 0.0254
+_LENGTHS = {
+    "m": 1.0,
+    "mm": MILLIMETRE_M,
+    "um": MICROMETRE_M,
+    "µm": MICROMETRE_M,
+    "nm": NANOMETRE_M,
+    "inch": _INCH_M,
+}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEGREE_RAD, "turn": 2 * np.pi}
+_TIMES = {
+    "s": 1.0,
+    "ms": MILLISECOND_S,
+    "us": MICROSECOND_S,
+    "µs": MICROSECOND_S,
+    "ns": NANOSECOND_S,
+}
+DATE = "date"
+"""The unit of instants that are no numbers in the file: dates in text, stamps of messages."""
+
+SINCE_1970 = {
+    "unix": 1.0,
+    "unix_ms": MILLISECOND_S,
+    "unix_us": MICROSECOND_S,
+    "unix_ns": NANOSECOND_S,
+}
+"""Units of times since 1970, and what one of them is in seconds."""
+
+UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
+    {
+        **dict.fromkeys(("x", "y", "z", "distance"), _LENGTHS),
+        **dict.fromkeys(("b", "c"), _ANGLES),
+        "intensity": {"1": 1.0, "%": 0.01},
+        "time": {**_TIMES, **SINCE_1970, DATE: 1.0},
+        "trigger": {"1": 1.0},
+    }
+)
+"""Units that a column of each channel may be in, and what one of them is in SI."""
+
+COUNT = "count"
+"""The unit of a raw reading: a column in it says what one count is in SI."""
+
+# What else files call units; with a Greek mu, too.
+_ALSO_LENGTHS = {
+    "μm": MICROMETRE_M,
+    "micron": MICROMETRE_M,
+    "microns": MICROMETRE_M,
+    "in": _INCH_M,
+    "cm": 0.01,
+    "pm": 1e-12,
+    "Å": 1e-10,
+    "mil": _INCH_M / 1000,
+}
+_ALSO_ANGLES = {
+    "°": DEGREE_RAD,
+    "degree": DEGREE_RAD,
+    "degrees": DEGREE_RAD,
+    "rev": 2 * np.pi,
+    "revs": 2 * np.pi,
+    "turns": 2 * np.pi,
+    "gon": np.pi / 200,
+    "µrad": 1e-6,
+    "urad": 1e-6,
+    "arcmin": DEGREE_RAD / 60,
+    "arcsec": DEGREE_RAD / 3600,
+}
+_ALSO_TIMES = {"sec": 1.0, "msec": MILLISECOND_S, "μs": MICROSECOND_S, "min": 60.0, "h": 3600.0}
+_OF_NO_CHANNEL = (
+    *("V", "mV", "µV", "uV", "A", "mA", "N", "Pa", "bar", "g", "K", "°C", "°F", "Hz", "kHz", "rpm"),
+    *("count", "counts", "digit", "digits", "LSB", "raw"),
+)
+_SAID = {
+    channel: {
+        **units,
+        **(_ALSO_LENGTHS if "mm" in units else {}),
+        **(_ALSO_ANGLES if "deg" in units else {}),
+        **(_ALSO_TIMES if "ms" in units else {}),
+    }
+    for channel, units in UNITS.items()
+}
+WORDS = frozenset[str]().union(*_SAID.values(), _OF_NO_CHANNEL) - {"1"}
+"""What a file may call a unit, of whatever it is; log[1] is a place."""
+
+# One turn in each unit that it may be counted in.
+_TURNS = {"deg": 360.0, "rad": 2 * np.pi, "mrad": 2000 * np.pi, "turn": 1.0}
+# A reading falls short of a whole turn by its own step at most.
+_NEARLY = 0.9
+
+
+def is_other(stated: str, unit: str, channel: str) -> bool:
+    """Return whether ``stated``, a file's own word, is another unit than ``unit`` of the map.
+
+    A word that is no unit says nothing, and a raw ``count`` is what the map says it is.
+    """
+    known = unit in UNITS[channel] and stated in WORDS
+    return known and _SAID[channel].get(stated) != UNITS[channel][unit]
+
+
+def check_share(values: FloatArray, unit: str) -> None:
+    """Raise DataError where ``values`` (n,), shares of the full intensity, are mostly above 1."""
+    finite = values[np.isfinite(values)]
+    middle = float(np.median(finite)) if len(finite) else 0.0
+    if unit and middle > 1:
+        better = "'%'" if unit == "1" else "count, and count: what one is of the full intensity"
+        raise DataError(
+            f"intensity is {middle:.4g} of 1 at its median, more than all; write unit: {better}"
+        )
+
+
+def check_turns(values: FloatArray, unit: str, axis: str) -> None:
+    """Raise DataError where an axis begins its turns anew after those of another unit.
+
+    values: (n,) in ``unit``, in order. One that turns one way, stays within a turn of some unit,
+    and falls back by it is counted in that unit: 359.3, 0.1, 0.8 are no radians.
+    """
+    finite = values[np.isfinite(values)]
+    steps = np.diff(finite)
+    if unit not in _TURNS or len(steps) < 2:
+        return
+    step, extent = float(np.median(steps)), float(np.ptp(finite))
+    back = float(np.max(-np.sign(step) * steps))
+    fits = [u for u, turn in _TURNS.items() if _NEARLY * turn < back and extent <= turn]
+    if fits and unit not in fits and 0 < 10 * abs(step) < back:
+        raise DataError(
+            f"{axis} falls back by {back:.6g} while it turns, as one counted in {fits[0]} does, "
+            f"the map says {unit}; correct the map, or write unit: {COUNT} and {COUNT}: what one "
+            "is in radians"
+        )
