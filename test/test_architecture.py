@@ -20,7 +20,7 @@ LAYERS = [
     {"twin", "protocols"},
     {"core"},
     {"parameters"},
-    {"quantities"},
+    {"quantities", "foreign_units"},
     {"errors", "units", "readable", "least_squares", "scipy_parts", "loading", "seconds"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

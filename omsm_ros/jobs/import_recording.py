@@ -22,8 +22,8 @@ from omsm_ros.core.samples.foreign_columns import (
     distance_blocks,
     in_step,
 )
-from omsm_ros.core.samples.foreign_units import DATE
 from omsm_ros.errors import DataError, FileError
+from omsm_ros.foreign_units import DATE
 from omsm_ros.jobs.foreign_rows import Origin, RowCounter
 from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.quantities import shown

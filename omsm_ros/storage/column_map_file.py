@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.core.samples.foreign_columns import CHANNELS, Column, ColumnMap
-from omsm_ros.core.samples.foreign_units import COUNT, UNITS
 from omsm_ros.errors import DataError, FileError
+from omsm_ros.foreign_units import COUNT, UNITS
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.storage import strict_yaml
 from omsm_ros.storage.files import read_text

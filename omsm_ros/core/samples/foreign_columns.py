@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
-from omsm_ros.core.samples.foreign_units import (
+from omsm_ros.errors import DataError
+from omsm_ros.foreign_units import (
     DATE,
     SINCE_1970,
     check_share,
     check_turns,
     is_other,
 )
-from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
 from omsm_ros.units import NANOSECONDS_PER_S
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.foreign_units import DATE, UNITS
 from omsm_ros.errors import FileError
+from omsm_ros.foreign_units import DATE, UNITS
 
 MAX_ROWS = 200_000_000
 PIECE_ROWS = 100_000

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.foreign_units import WORDS
 from omsm_ros.errors import FileError
+from omsm_ros.foreign_units import WORDS
 from omsm_ros.quantities import shown
 from omsm_ros.storage.files import open_regular
 from omsm_ros.storage.foreign.dates import EXPECTED, seconds_since_1970

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import DataError
 from omsm_ros.units import (
     DEGREE_RAD,
@@ -117,7 +117,7 @@ def is_other(stated: str, unit: str, channel: str) -> bool:
     return known and _SAID[channel].get(stated) != UNITS[channel][unit]
 
 
-def check_share(values: FloatArray, unit: str) -> None:
+def check_share(values: NDArray[np.float64], unit: str) -> None:
     """Raise DataError where ``values`` (n,), shares of the full intensity, are mostly above 1."""
     finite = values[np.isfinite(values)]
     middle = float(np.median(finite)) if len(finite) else 0.0
@@ -128,7 +128,7 @@ def check_share(values: FloatArray, unit: str) -> None:
         )
 
 
-def check_turns(values: FloatArray, unit: str, axis: str) -> None:
+def check_turns(values: NDArray[np.float64], unit: str, axis: str) -> None:
     """Raise DataError where an axis begins its turns anew after those of another unit.
 
     values: (n,) in ``unit``, in order. One that turns one way, stays within a turn of some unit,
