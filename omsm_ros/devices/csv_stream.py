@@ -84,8 +84,7 @@ class CsvStreamDevice(StreamDevice):
             samples["status"] = np.where(good & ~measured, Status.NO_TARGET, known)
         for index, name in enumerate(AXIS_COLUMNS):
             if name in self._columns:
-                inside = np.clip(rows[name], -(2**40), 2**40)
-                samples["counts"][:, index] = np.rint(inside * _PARTS).astype(np.int64)
+                samples["counts"][:, index] = np.rint(rows[name] * _PARTS).astype(np.int64)
         return samples
 
     def _listen_in(self, silent: float) -> None:

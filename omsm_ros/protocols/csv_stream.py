@@ -28,6 +28,13 @@ _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _SEPARATOR = re.compile(rb"[,;\s]+")
 
 
+# A line whose numbers cannot be what they are called is none: counts that no counter reaches,
+# times of centuries, positions of hundreds of metres in tenths of a nanometre.
+_RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
+_RANGES |= dict.fromkeys(AXIS_COLUMNS, (-(2**40), 2**40))
+_OTHER_RANGE = (-(2**62), 2**62)
+
+
 def check_columns(columns: Sequence[str]) -> None:
     """Raise ConfigurationError unless ``columns`` can be read.
 
@@ -115,7 +122,8 @@ class CsvDecoder:
             if not (_INTEGER if whole else _NUMBER).fullmatch(word):
                 return None
             value = int(word) if whole else float(word)
-            if not abs(value) < 2**63:
+            least, most = _RANGES.get(name, _OTHER_RANGE)
+            if not least <= value <= most:
                 return None
             row.append(value)
         return tuple(row)

@@ -11,7 +11,10 @@ from omsm_ros.devices.csv_stream import CsvSettings, CsvStreamDevice
 from omsm_ros.devices.generic_stream import GenericStreamDevice
 from omsm_ros.emulators.csv_stream import CsvStreamEmulator
 from omsm_ros.emulators.instrument import Instrument
+from omsm_ros.emulators.loopback import Clock
 from omsm_ros.protocols.generic_stream import AxisScaling, StreamScaling
+
+from .scripted_stream import Script
 
 
 @pytest.mark.parametrize("portion", [1 << 20, 7])
@@ -106,3 +109,18 @@ def test_a_quiet_line_is_no_trouble(bench: Any, device: Any) -> None:
     run.run(6.0)
     assert run.troubles == []
     assert run.connections == 1
+
+
+@pytest.mark.parametrize("number", [b"-1", b"4503599627370497", b"9223372036854775807"])
+def test_a_number_that_no_counter_has_costs_its_line(number: bytes) -> None:
+    """Half of the numbers are spoilt; the driver goes on, and the rest is where it was."""
+    lines = [
+        b"%s,%d,%d,0,%d,0,0,0,0\n" % (number if k % 2 else b"%d" % k, k * 10**6, k, k)
+        for k in range(40)
+    ]
+    device = CsvStreamDevice(Script(*lines), CsvSettings(block_size=1), Clock().nanoseconds)
+    device.open()
+    blocks = [pair for _ in lines for pair in device.poll(0.05)] + device.close()
+    found = {pair.distance.first_sample: pair.distance.distance[0] for pair in blocks}
+    assert found == pytest.approx({k: k * 1e-9 for k in range(0, 40, 2)})
+    assert device.counts()["malformed"] == 20
