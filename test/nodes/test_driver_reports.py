@@ -1,0 +1,157 @@
+"""What a driver publishes of its blocks, settings and state: with a device that is written down."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("omsm_msgs", reason="the messages are not built")
+
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.recent import Flow, RecentIncrease
+from omsm_ros.devices.reader import State
+from omsm_ros.nodes import driving
+from omsm_ros.nodes.diagnostics import ERROR, OK, STALE, WARN
+from omsm_ros.nodes.driving import DriverNode
+from omsm_ros.storage import conversions
+
+
+class Published(list):
+    def publish(self, message):
+        self.append(message)
+
+    def get_subscription_count(self):
+        return 3
+
+    def __bool__(self):
+        return True
+
+
+class Driver(SimpleNamespace):
+    """A DriverNode's own methods on what they need, without a node of ROS."""
+
+    report, _publish = DriverNode.report, DriverNode._publish
+    _tell_settings, _both = DriverNode._tell_settings, DriverNode._both
+    _add_faults, _add_silence = DriverNode._add_faults, DriverNode._add_silence
+    hardware_id = DriverNode.hardware_id
+
+
+@pytest.fixture
+def driver(monkeypatch):
+    now = [50.0]
+    monkeypatch.setattr(driving.time, "monotonic", lambda: now[0])
+    counts = {"received": 0, "decoded": 0, "malformed": 0, "lost": 0, "losses_of_sync": 0}
+    made = Driver(
+        now=now, counts=counts,
+        values={"device": "six_channel", "port": "tcp://a:1", "sample_period": 1e-3,
+                "machine_frame": "mill", "probe_frame": "needle"},
+        _device=SimpleNamespace(counts=lambda: dict(counts), identity={"version": "2.1"},
+                                settings={"rate_hz": 1000.0}),
+        _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
+        _recent=RecentIncrease(), _flow=Flow(), _reported={}, _messages=conversions.ros_messages(),
+        _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
+        _settings=Published(),
+    )  # fmt: skip
+
+    def passes(seconds, samples, **more):
+        now[0] += seconds
+        counts["decoded"] += samples
+        for name, n in more.items():
+            counts[name] += n
+        return made.report()
+
+    made.passes = passes
+    made.report()
+    return made
+
+
+def test_a_device_that_reads_is_well_and_says_how_fast(driver):
+    for _ in range(5):
+        report = driver.passes(1.0, 1000)
+    assert (report.level, report.text) == (OK, "reading at 1000 Hz")
+    assert report.values["state"] == "reading"
+    assert report.values["version"] == "2.1"
+    assert report.values["connections"] == 2
+    assert report.values["decoded"] == 5000
+    assert report.values["axes_subscribers"] == report.values["confocal_subscribers"] == 3
+    assert driver.hardware_id() == "tcp://a:1"
+
+
+def test_what_goes_wrong_is_told_by_name_for_as_long_as_it_is_new(driver):
+    driver.passes(1.0, 1000)
+    report = driver.passes(1.0, 1000, malformed=3, losses_of_sync=1)
+    assert report.level == WARN
+    assert report.text == "just now: malformed 3, losses_of_sync 1"
+    for _ in range(15):
+        report = driver.passes(1.0, 1000)
+    assert report.level == OK
+    assert report.values["malformed"] == 3  # it stays in the history
+
+
+def test_a_device_that_never_sent_anything_and_one_that_fell_silent(driver):
+    report = driver.passes(1.0, 0)
+    assert (report.level, report.text) == (STALE, "connected, but no sample has come yet")
+    driver.passes(1.0, 500)
+    assert driver.passes(1.9, 0).level == OK
+    report = driver.passes(2.1, 0)
+    assert (report.level, report.text) == (STALE, "no sample for 4 s")
+
+
+def test_a_slow_device_is_not_silent_between_its_samples(driver):
+    driver.values["sample_period"] = 10.0
+    driver.passes(1.0, 1)
+    assert driver.passes(45.0, 0).level == OK
+    assert driver.passes(10.0, 0).level == STALE
+
+
+@pytest.mark.parametrize("state", [State.CONNECTING, State.LOST])
+def test_before_it_reads_silence_is_not_what_is_wrong(driver, state):
+    driver._reader.state, driver._reader.trouble = state, "no answer from tcp://a:1"
+    report = driver.passes(60.0, 0)
+    assert (report.level, report.text) == (ERROR, "no answer from tcp://a:1")
+    assert report.values["state"] == state.value
+
+
+def pair():
+    k = np.arange(4.0)
+    same = {"stamp_ns": 7 * 10**9 + 5, "first_sample": 12, "sample_period": 1e-3}
+    return (
+        AxisBlock(x=k, y=k + 1, z=k + 2, b=k + 3, c=k + 4, **same),
+        DistanceBlock(distance=k * 1e-6, **same),
+    )
+
+
+def test_blocks_go_out_with_their_frames_stamps_and_values(driver):
+    axes, distance = pair()
+    driver._publish([(axes, distance), (None, distance), (axes, None)])
+    assert (len(driver._axes), len(driver._distance)) == (2, 2)
+    sent = driver._axes[0]
+    assert sent.header.frame_id == "mill"
+    assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (7, 5)
+    assert (sent.first_sample, sent.sample_period) == (12, 1e-3)
+    for name in ("x", "y", "z", "b", "c"):
+        assert list(getattr(sent, name)) == list(getattr(axes, name))
+    assert driver._distance[0].header.frame_id == "needle"
+    assert list(driver._distance[0].distance) == [0.0, 1e-6, 2e-6, 3e-6]
+
+
+def test_a_driver_of_axes_alone_passes_over_distances(driver):
+    driver._distance_topic = driver._distance = None
+    driver._publish([pair()])
+    assert len(driver._axes) == 1
+    assert [topic for topic, _ in driver._both()] == ["axes"]
+
+
+def test_settings_are_told_once_before_the_first_block_and_again_when_they_change(driver):
+    order = []
+    driver._settings.publish = lambda message: order.append(json.loads(message.data))
+    driver._axes.publish = lambda message: order.append("axes")
+    driver._publish([pair()])
+    driver._publish([pair()])
+    driver._device.settings = {"rate_hz": 2000.0}
+    driver._publish([pair()])
+    told = {"probe.device": "six_channel", "probe.rate_hz": 1000.0}
+    assert order == [told, "axes", "axes", told | {"probe.rate_hz": 2000.0}, "axes"]
+    driver._settings = None
+    driver._tell_settings()
