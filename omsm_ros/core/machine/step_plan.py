@@ -133,8 +133,8 @@ def plan_csv(plan: StepPlan, period: float) -> str:
     if plan.duration > _MOST_LINES * period:
         raise ConfigurationError(
             f"step plan: {quantity(plan.duration, 's')} every {quantity(period, 's')} are "
-            f"{count(round(plan.duration / period))} lines, at most {_MOST_LINES}; plan fewer "
-            "steps or shorter rests"
+            f"{count(round(plan.duration / period))} lines, at most {count(_MOST_LINES)}; "
+            "plan fewer steps or shorter rests"
         )
     time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
     rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]
