@@ -13,10 +13,10 @@ from scipy.special import erf
 
 from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR
 from omsm_ros.core.correction.unknown_curves import components, random_walk
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
-# Of an error correlated over half the radius of a disc 18 shapes hold what is kept, over a quarter
-# 54, as with four times as many nodes.
+# Of an error correlated over half the radius of a disc 19 shapes hold what is kept, over a quarter
+# 57, as with four times as many nodes.
 _NODES = 400
 # Of the variance, which changes a standard uncertainty by 0.25 %.
 _LEFT_OUT = 0.005
@@ -28,11 +28,13 @@ def unknown_form(x: FloatArray, y: FloatArray, size: FloatArray, length: float) 
     """Return the shapes (k, m) of an error of standard deviation ``size`` (m,) [m] at x, y (m,).
 
     Its covariance falls with the distance d as ``exp(−d² / 2 length²)``. The shapes are found on
-    some of the places and carried to the others (Nyström), and scaled to the full variance.
+    400 of the places, as far from each other as can be, and carried to the others (Nyström), and
+    scaled to the full variance. A length shorter than their distance is taken for it.
     """
     if len(x) == 0 or not np.any(size > 0):
         return np.empty((0, len(x)))
-    some = np.linspace(0, len(x) - 1, min(_NODES, len(x))).astype(np.int64)
+    some, apart = _nodes(x, y)
+    length = max(length, apart)
     nodes = np.column_stack([x[some], y[some]])
     values, vectors = np.linalg.eigh(_kernel(nodes, nodes, length))
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
@@ -43,6 +45,21 @@ def unknown_form(x: FloatArray, y: FloatArray, size: FloatArray, length: float) 
     )
     found = np.linalg.norm(carried, axis=1, keepdims=True)
     return np.asarray((size[:, np.newaxis] * carried / np.maximum(found, 1e-9)).T, np.float64)
+
+
+def _nodes(x: FloatArray, y: FloatArray) -> tuple[IntArray, float]:
+    """Return the numbers of the nodes, and the least distance between two of them [m].
+
+    Each is the place that is farthest from those before it (T. Gonzalez, Theor. Comput. Sci. 38,
+    293): of a map of rows, every k-th place would leave wide gaps between columns of nodes.
+    """
+    nodes, apart = [0], 0.0
+    nearest = np.hypot(x - x[0], y - y[0])
+    while len(nodes) < min(_NODES, len(x)) and (farthest := float(nearest.max())) > 0:
+        nodes.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.hypot(x - x[nodes[-1]], y - y[nodes[-1]]))
+        apart = farthest
+    return np.array(nodes), apart
 
 
 def _kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
