@@ -42,7 +42,8 @@ def free_run(
     Nothing of the model is fitted again; only the state that it starts in, and a constant, are
     taken from the output. Samples are a ``sample_period`` of the model apart.
 
-    Raises IdentificationError for a record that is too short, or that does not change.
+    Raises IdentificationError for a record that is too short, that does not change, or of whose
+    input something is missing.
     """
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
     if np.sum(counted) < _LEAST_SAMPLES or len(input) != len(output):
@@ -50,7 +51,7 @@ def free_run(
             f"input of {len(input)!r} samples, output of {int(np.sum(counted))!r} that count; "
             f"at least {_LEAST_SAMPLES} of both are needed; record longer"
         )
-    check_changes(input, "input")
+    check_input(input)
     check_changes(output[counted], "output")
     driven, free = _responses(model, input - model.working_point[0])
     columns = np.column_stack([*free, np.ones(len(input))])
@@ -60,6 +61,20 @@ def free_run(
     rms = float(np.sqrt(np.mean(residual[counted] ** 2)))
     variance = float(np.var(output[counted]))
     return FreeRun(np.asarray(run), residual, 1 - rms**2 / variance, rms)
+
+
+def check_input(input: FloatArray) -> None:
+    """Raise IdentificationError for an input that does not change, or of which a value is missing.
+
+    What follows a missing value would be as unknown as it is.
+    """
+    missing = int(np.count_nonzero(~np.isfinite(input)))
+    if missing:
+        raise IdentificationError(
+            f"the input has {missing!r} values that are not finite; cut the record there, or fill "
+            "them in"
+        )
+    check_changes(input, "input")
 
 
 def check_changes(values: FloatArray, name: str) -> None:

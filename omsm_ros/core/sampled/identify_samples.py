@@ -26,7 +26,7 @@ from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoic
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.sampled.band_limited import band_limited
-from omsm_ros.core.sampled.free_run import check_changes, resting_output
+from omsm_ros.core.sampled.free_run import check_changes, check_input, resting_output
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
 from omsm_ros.core.sampled.verdict import (
     SAMPLED_LIMITS,
@@ -91,7 +91,7 @@ def identify_samples(
     if hold not in HOLDS:
         raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
     used = np.isfinite(output) if used is None else used & np.isfinite(output)
-    check_changes(input, "input")
+    check_input(input)
     check_changes(output[used], "output")
     if hold == BAND_LIMITED:
         return band_limited(input, output, used, period, order, SAMPLED_LIMITS)

@@ -14,6 +14,7 @@ from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held
 from omsm_ros.core.dynamics.response_band import Band, ResponseLimits
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.sampled.free_run import free_run, resting_output
+from omsm_ros.core.sampled.identify_samples import identify_samples
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
 from omsm_ros.core.sampled.verdict import longest_range, sampled_certificate
 from omsm_ros.core.samples.blocks import FloatArray
@@ -277,6 +278,19 @@ def test_where_it_was_cut_does_not_matter_once_it_has_settled() -> None:
 def test_columns_of_different_length_are_refused() -> None:
     with pytest.raises(IdentificationError, match="input of 599 samples, output of 600"):
         free_run(HELD, U[1:], Y)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_input_of_which_values_are_missing_is_refused(value: float) -> None:
+    """Not run on to an output of nothing."""
+    holed = np.where(np.isin(np.arange(len(U)), [50, 51]), value, U)
+    for run in (
+        lambda: free_run(HELD, holed, Y),
+        lambda: identify_samples(holed, Y, PERIOD),
+        lambda: identify_samples(holed, Y, PERIOD, hold=BAND_LIMITED),
+    ):
+        with pytest.raises(IdentificationError, match="input has 2 values that are not finite"):
+            run()
 
 
 def test_the_resting_output_is_that_of_the_mean_input() -> None:
