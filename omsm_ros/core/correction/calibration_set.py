@@ -162,7 +162,7 @@ def _certificate(middle: Calibration, members: Sequence[Calibration]) -> dict[st
 def _latency(members: Sequence[Calibration]) -> Latency:
     """Return the latency of the probe, which is one wherever the slides stand."""
     each = [latency_of(c) for c in members]
-    lag = max(c.dynamics.low_frequency_delay for c in members)
+    lag = max((c.dynamics.low_frequency_delay for c in members), key=abs)
     if not all(latency.resolved for latency in each):
         return unresolved(lag)
     delays = [latency.delay_s for latency in each]
