@@ -170,6 +170,16 @@ def test_more_tries_are_never_worse() -> None:
     assert all(later <= before for before, later in pairwise(left))
 
 
+def test_a_step_that_makes_it_worse_is_not_taken() -> None:
+    """Newton's method on an arcus tangent goes from 3 to -9 and on, ever further out."""
+    bent = Watched(
+        lambda p: np.arctan(10 * p), lambda p: np.array([10 / (1 + (10 * p) ** 2)]).reshape(1, 1)
+    )
+    left = [cost(bent.down([0.3], *open_box(1), k)) for k in range(15)]
+    assert all(later <= before for before, later in pairwise(left))
+    assert left[-1] < 1e-6 * left[0]
+
+
 def test_no_step_leaps() -> None:
     """Of a logarithm e³ at once, however far a quadratic model would go."""
     flat = Watched(lambda p: np.array([1e-3 * p[0] - 1.0]), lambda _: np.array([[1e-3]]))
