@@ -9,6 +9,7 @@ q = z⁻¹ for s. The denominator is a product of sections of
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,24 +35,36 @@ _OFF_BORDER = 1e-6
 class DiscreteScaled(Scaled):
     """Sections in w of a denominator in q; numerators are polynomials in q."""
 
-    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return L = 1 / denominator (k,) and d ln L / dψ (len ψ, k) at q = ``s`` (k,)."""
-        up, down = 1 + s, _PER_BILINEAR * (1 - s)
+    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return L = 1 / denominator at q = ``s`` (k,), (k,)."""
         denominator = np.ones_like(s)
+        for value, _ in self._factors(nonlinear, s):
+            denominator *= value
+        return np.asarray(1 / denominator)
+
+    def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return d ln L / dψ (len ψ, k) at q = ``s`` (k,), see :meth:`lag`."""
         first, second = [], []
+        for value, (linear, *square) in self._factors(nonlinear, s):
+            first.append(-linear / value)
+            second += [-term / value for term in square]
+        return np.array(first + second, np.complex128).reshape(-1, len(s))
+
+    def _factors(
+        self, nonlinear: FloatArray, s: ComplexArray
+    ) -> Iterator[tuple[ComplexArray, list[ComplexArray]]]:
+        """Yield each factor of the denominator at q = ``s``, and its terms beyond the first.
+
+        Not from its coefficients in q: near q = 1 those of a slow pole cancel.
+        """
+        up, down = 1 + s, _PER_BILINEAR * (1 - s)
         for section in self.sections(nonlinear):
             if len(section) == 3:
-                square = section[2] * down * down
-                linear = section[1] * down * up
-                value = up * up + linear + square
-                second.append(-square / value)
+                terms = [section[1] * down * up, section[2] * down * down]
+                yield up * up + terms[0] + terms[1], terms
             else:
                 linear = section[1] * down
-                value = up + linear
-            first.append(-linear / value)
-            denominator = denominator * value
-        relative = np.array(first + second, np.complex128)
-        return 1 / denominator, relative.reshape(-1, len(s))
+                yield up + linear, [linear]
 
     def polynomials(self, nonlinear: FloatArray) -> list[FloatArray]:
         """Return the factors of the denominator, ascending in q."""
@@ -120,19 +133,44 @@ class HeldProblem(Problem):
         spectra[:, 0] = 0.0
         return spectra
 
+    def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
+        """Return the linear columns where they are compared, (terms, k).
+
+        Each is the one before, a sample later: the period has no bridge, so it turns round.
+        """
+        rows = []
+        for spectrum, count in self.drives(structure):
+            base = lag * spectrum
+            base[0] = 0.0
+            first = fft.irfft(base, self.closed_length)
+            rows += [np.take(first, self._places - late, mode="wrap") for late in range(count)]
+        return np.array(rows)
+
+    def _answer(
+        self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
+    ) -> ComplexArray:
+        """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
+        total, place = np.zeros_like(lag), 0
+        for spectrum, count in self.drives(structure):
+            # A polynomial in q at every line is the transform of its coefficients.
+            part = coefficients[place : place + count]
+            total += fft.rfft(part, self.closed_length) * spectrum
+            place += count
+        total[0] = 0.0
+        return lag * total
+
     def columns(self, fitted: Fit) -> FloatArray:
         """Return d output / d(terms of the numerator, ψ, initial state, background), (k, …)."""
-        lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
-        driven = self._driven(fitted.structure, lag)
+        driven = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
         terms = fitted.structure.zeros + 1
-        by_nonlinear = relative * (fitted.driven @ driven)
+        slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
+        by_nonlinear = slopes * (fitted.driven @ driven)
         every = np.concatenate([driven[:terms], by_nonlinear, driven[terms:]])
         return np.column_stack([self._in_time(every).T, self._fixed])
 
     def free_run(self, fitted: Fit) -> FloatArray:
         """Return the output (n,) of ``fitted`` with initial state and offset fitted anew."""
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
-        spectra = self._driven(fitted.structure, lag)
+        spectra = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
         terms = fitted.structure.zeros + 1
         columns = fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T
         moved = columns[:, :terms] @ fitted.driven[:terms]

@@ -90,21 +90,25 @@ class Scaled:
     def _delay(self, nonlinear: FloatArray) -> float:
         return float(nonlinear[-1]) if self.structure.delay else 0.0
 
-    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return L = e^{-τs} / denominator (k,) and d ln L / dψ (len ψ, k) at scaled ``s`` (k,)."""
+    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return L = e^{-τs} / denominator at scaled ``s`` (k,), (k,)."""
         denominator = np.ones_like(s)
+        for section in self.sections(nonlinear):
+            denominator = denominator * polynomial.polyval(s, section)
+        if not self.structure.delay:
+            return np.asarray(1 / denominator)
+        return np.asarray(np.exp(-self._delay(nonlinear) * s) / denominator)
+
+    def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
         first, second = [], []
         for section in self.sections(nonlinear):
-            value = 1 + section[1] * s
+            value = polynomial.polyval(s, section)
             if len(section) == 3:
-                square = section[2] * s * s
-                value = value + square
-                second.append(-square / value)
+                second.append(-section[2] * s * s / value)
             first.append(-section[1] * s / value)
-            denominator = denominator * value
         tail = [-s] if self.structure.delay else []
-        relative = np.array(first + second + tail, np.complex128)
-        return np.exp(-self._delay(nonlinear) * s) / denominator, relative.reshape(-1, len(s))
+        return np.array(first + second + tail, np.complex128).reshape(-1, len(s))
 
     def transfer_function(self, nonlinear: FloatArray, numerator: FloatArray) -> TransferFunction:
         """Return G(s) in SI units, from ψ and the scaled ascending ``numerator``."""

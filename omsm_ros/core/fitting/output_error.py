@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import polynomial
 from scipy import fft, linalg
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
@@ -27,6 +28,8 @@ from omsm_ros.least_squares import least_squares
 
 # A linear column weaker than this part of the strongest is rounding.
 _RANK_TOLERANCE = 1e-12
+# Columns that LAPACK takes at a time.
+_BLOCK = 32
 # Of each start; held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
 # A bound for fits that creep along a valley; others end by convergence before.
@@ -104,7 +107,7 @@ class Problem:
 
     def initial_condition_response(self, fitted: Fit) -> FloatArray:
         """Return the decays (n, poles) at the poles of ``fitted`` from before the first sample."""
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
         decays = fft.irfft(powers * (lag * self._pulse), self.closed_length)
         return np.asarray(decays[:, : len(self.input)].T)
@@ -127,27 +130,48 @@ class Problem:
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
         self.effort.comparisons += 1
-        lag, relative = scaled.lag(nonlinear, self.s)
-        driven = self._driven(scaled.structure, lag)
+        structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
+        moved = self._moved(structure, lag)
         # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
-        columns = np.concatenate([self._in_time(driven), self._fixed.T]).T
-        basis, triangle = linalg.qr(columns, mode="economic", check_finite=False)
-        linear = least_squares(triangle, basis.T @ self._target, _RANK_TOLERANCE)
-        residual = self._target - columns @ linear
+        columns = np.concatenate([moved, self._fixed.T, self._target[np.newaxis]]).T
+        size = columns.shape[1] - 1
+        # The target among the columns: what it is on their basis needs no basis then.
+        (packed, factors), triangle = linalg.qr(columns, mode="raw", check_finite=False)
+        linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
+        residual = self._target - columns[:, :size] @ linear
 
         def derivative() -> FloatArray:
-            moved = self._in_time(relative * (linear[: len(driven)] @ driven)).T
-            return np.asarray(basis @ (basis.T @ moved) - moved)
+            basis = linalg.lapack.dorgqr(packed[:, :size], factors[:size], lwork=_BLOCK * size)[0]
+            answer = self._answer(structure, lag, linear[: len(moved)])
+            slopes = self._in_time(scaled.lag_slopes(nonlinear, self.s) * answer).T
+            return np.asarray(basis @ (basis.T @ slopes) - slopes)
 
         return Projection(nonlinear, residual, linear, derivative)
 
+    def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
+        """Return the linear columns where they are compared, (terms, k)."""
+        return self._in_time(self._driven(structure, lag))
+
+    def _answer(
+        self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
+    ) -> ComplexArray:
+        """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
+        total, place = np.zeros_like(lag), 0
+        for spectrum, count in self.drives(structure):
+            part = coefficients[place : place + count]
+            total += polynomial.polyval(self.s, part) * spectrum
+            place += count
+        return lag * total
+
     def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
         """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
-        terms = [
-            self.s ** np.arange(count)[:, np.newaxis] * (lag * spectrum)
-            for spectrum, count in self.drives(structure)
-        ]
-        return np.concatenate(terms)
+        terms = []
+        for spectrum, count in self.drives(structure):
+            terms.append(lag * spectrum)
+            # One more factor each: powers of complex numbers take a logarithm.
+            for _ in range(count - 1):
+                terms.append(terms[-1] * self.s)
+        return np.array(terms)
 
     def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:
         """Return ``values`` (k,) of the compared samples at their places, (n,)."""
@@ -162,24 +186,24 @@ class Problem:
 
     def output_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
         return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """Return the output (n,) of the fitted model at every sample."""
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = fitted.driven @ self._driven(fitted.structure, lag)
         moved = fft.irfft(driven, self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
         """Return d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
-        lag, relative = fitted.scaled.lag(fitted.nonlinear, self.s)
-        driven = self._driven(fitted.structure, lag)
+        driven = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
         terms = len(fitted.numerator)
         by_numerator = fitted.gain * driven[1:terms]
-        by_nonlinear = relative * (fitted.driven @ driven)
+        slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
+        by_nonlinear = slopes * (fitted.driven @ driven)
         by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
         moved = self._in_time(np.concatenate([by_numerator, by_nonlinear, by_gain, driven[terms:]]))
         return np.column_stack([moved.T, self._fixed])
@@ -189,7 +213,7 @@ class Problem:
 
         That is by coefficients of 1, s and s² in front of it: any response bends like that.
         """
-        lag, _ = fitted.scaled.lag(fitted.nonlinear, self.s)
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])

@@ -35,7 +35,7 @@ def test_the_denominator_is_that_of_the_poles():
         whole = np.polynomial.polynomial.polymul(whole, factor)
     np.testing.assert_allclose(whole / whole[0], A, atol=1e-5)
     q = np.exp(-1j * np.array([0.1, 1.0, 3.0]))
-    lag, _ = SCALED.lag(nonlinear, q)
+    lag = SCALED.lag(nonlinear, q)
     expected = 1 / np.polynomial.polynomial.polyval(q, whole)
     np.testing.assert_allclose(lag, expected, rtol=1e-9)
 
