@@ -7,6 +7,7 @@ modes of a high order at once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +26,8 @@ _ITERATIONS = 8
 _SPARE_ROWS = 5
 # Thirty times its rows at the highest order; more only cost time.
 _MAX_COLUMNS = 5000
+# Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
+_FAST = float(np.log(0.1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +129,29 @@ def _poles(coefficients: FloatArray) -> ComplexArray:
     if not np.all(np.isfinite(coefficients)):
         return np.empty(0, np.complex128)
     return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
+
+
+def grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
+    """Return the starts for one pole more than the last of ``smaller``.
+
+    A pole too fast to matter, so that a larger model never fits worse; and two as slow as the
+    record is long: descent alone does not reach a pair of integrators from other starts.
+    """
+    slow = np.log(samples / 2)
+    fast = [with_fast_pole(smaller[-1])]
+    return fast + [_with_pole(_with_pole(found, slow), slow) for found in smaller[-2:-1]]
+
+
+def with_fast_pole(nonlinear: FloatArray) -> FloatArray:
+    """Return ψ (n+1,) of ``nonlinear`` (n,) with a pole too fast to matter."""
+    return _with_pole(nonlinear, _FAST)
+
+
+def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
+    """Return ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
+    pairs, odd = divmod(len(nonlinear), 2)
+    first, second = nonlinear[:pairs], nonlinear[pairs + odd :]
+    if not odd:
+        return np.concatenate([first, [log_time], second])
+    merged = np.logaddexp(nonlinear[pairs], log_time)
+    return np.concatenate([first, [merged], second, [nonlinear[pairs] + log_time]])

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.fitting.covariance import autoregression
-from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
+from omsm_ros.core.fitting.discrete_starts import DiscreteStarts, grown
 from omsm_ros.core.fitting.held_problem import RATE_SAMPLES, DiscreteScaled, HeldProblem
 from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import Fit, fit
@@ -48,8 +48,6 @@ _MOST_SAMPLES = 200_000
 _HIDDEN_EVALUATIONS = 5
 # Of the power of the strongest direction: what is weaker is rounding of a text with six digits.
 _UNEXCITED = 1e-12
-# Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
-_FAST = float(np.log(0.1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,43 +98,48 @@ def choose_sampled(
     Raises IdentificationError when too few samples are used for the order asked for, or the input
     has too few frequencies, for an order beyond MAX_ORDER, or where a value is not finite.
     """
-    most = _highest_order(int(np.sum(used)), order)
-    if np.ptp(input) == 0:
-        raise IdentificationError("the input never changes; excite it while recording")
-    if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
-        raise IdentificationError("a value of input or output is not finite where it is used")
-    most = _most_excited(input, most, order)
+    most = check_record(input, output, used, order)
     centred = np.where(used, output - np.mean(output[used]), 0.0)
     delay = _best_delay(input, centred, used, period, max_delay)
-    problem = _delayed(input, centred, used, period, delay)
-    part = _parts(problem.used)
+    problem = delayed(input, centred, used, period, delay)
+    part = parts(problem.used)
     early = replace(problem, used=problem.used & (part < _FIRST_PART * _PARTS))
     late = problem.used & ~early.used
     fits, by_order = _explored(early, late, most, order)
     finalists = _finalists(by_order, order)
     tried = [
-        SampledCandidate(problem, _refitted(problem, fits[n], white), n, white, np.empty(0))
+        SampledCandidate(problem, refitted(problem, fits[n], white), n, white, np.empty(0))
         for n in finalists
         for white in ((False, True) if n else (False,))
     ]
-    judged = [replace(c, hidden=_hidden_errors(c, part)) for c in tried]
+    judged = [replace(c, hidden=hidden_errors(c, part)) for c in tried]
     starts = DiscreteStarts(problem.input, problem.output, problem.used, most)
-    free = _finished(_plainest(judged), starts)
+    free = _finished(plainest(judged), starts)
     chosen = free
     if order and order != free.order:
-        chosen = _finished(_plainest([c for c in judged if c.order == order]), starts)
+        chosen = _finished(plainest([c for c in judged if c.order == order]), starts)
     return SampledChoice(chosen, free, delay, by_order)
+
+
+def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: int) -> int:
+    """Return the highest order that a record can tell; raises as :func:`choose_sampled` does."""
+    most = _highest_order(int(np.sum(used)), order)
+    if np.ptp(input) == 0:
+        raise IdentificationError("the input never changes; excite it while recording")
+    if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
+        raise IdentificationError("a value of input or output is not finite where it is used")
+    return _most_excited(input, most, order)
 
 
 def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
     """Return the candidate at the best minimum that starts from all used samples lead to."""
     if candidate.order == 0 or candidate.whitened:
         return candidate
-    every = [candidate.fit.nonlinear, *_proposed(candidate.problem, candidate.order, starts)]
+    every = [candidate.fit.nonlinear, *proposed(candidate.problem, candidate.order, starts)]
     return replace(candidate, fit=fit(candidate.problem, candidate.fit.structure, every))
 
 
-def _proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
+def proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
     """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
     scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
     proposed = [scaled.of_discrete(poles) for poles in starts.poles(order)]
@@ -184,13 +187,13 @@ def _most_excited(input: FloatArray, most: int, order: int) -> int:
     return min(most, (excited - 1) // 2)
 
 
-def _parts(used: BoolArray) -> FloatArray:
+def parts(used: BoolArray) -> FloatArray:
     """Return in which part, 0 to _PARTS, each used sample lies, with fractions; -1 elsewhere."""
     place = np.cumsum(used) - 1.0
     return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
 
 
-def _delayed(
+def delayed(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
 ) -> HeldProblem:
     late = np.roll(input, delay)
@@ -213,11 +216,11 @@ def _best_delay(
     same = used & (np.arange(len(used)) >= most)
     sums = []
     for delay in range(most + 1):
-        problem = _delayed(input, output, same, period, delay)
+        problem = delayed(input, output, same, period, delay)
         starts = DiscreteStarts(problem.input, problem.output, problem.used, _DELAY_ORDER)
         fits: list[Fit] = []
         for _ in range(_DELAY_ORDER + 1):
-            fits.append(_next_order(problem, fits, starts))
+            fits.append(next_order(problem, fits, starts))
         sums.append(fits[-1].sum_of_squares)
     return int(np.argmin(sums))
 
@@ -233,45 +236,24 @@ def _explored(
     errors: list[float] = []
     starts = DiscreteStarts(early.input, early.output, early.used, most)
     for order in range(most + 1):
-        fits.append(_next_order(early, fits, starts))
+        fits.append(next_order(early, fits, starts))
         errors.append(_missed(early, fits[-1], late))
         if order - int(np.argmin(errors)) >= _FRUITLESS and order >= at_least:
             break
     return fits, np.array(errors)
 
 
-def _next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
+def next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
     """Fit as many poles as there are ``smaller`` fits, and return the best."""
     order = len(smaller)
     structure = Structure(order, order, False)
     if order == 0:
         return fit(problem, structure, [np.empty(0)])
-    grown = _grown([f.nonlinear for f in smaller], len(problem.output))
-    return fit(problem, structure, _proposed(problem, order, starts) + grown)
+    larger = grown([f.nonlinear for f in smaller], len(problem.output))
+    return fit(problem, structure, proposed(problem, order, starts) + larger)
 
 
-def _grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
-    """Return the starts for one pole more than the last of ``smaller``.
-
-    A pole too fast to matter, so that a larger model never fits worse; and two as slow as the
-    record is long: descent alone does not reach a pair of integrators from other starts.
-    """
-    slow = np.log(samples / 2)
-    fast = [_with_pole(smaller[-1], _FAST)]
-    return fast + [_with_pole(_with_pole(found, slow), slow) for found in smaller[-2:-1]]
-
-
-def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
-    """Return ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
-    pairs, odd = divmod(len(nonlinear), 2)
-    first, second = nonlinear[:pairs], nonlinear[pairs + odd :]
-    if not odd:
-        return np.concatenate([first, [log_time], second])
-    merged = np.logaddexp(nonlinear[pairs], log_time)
-    return np.concatenate([first, [merged], second, [nonlinear[pairs] + log_time]])
-
-
-def _refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
+def refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
     """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``.
 
     evaluations: of a fit, as of :func:`fit` if not given
@@ -307,8 +289,12 @@ def _finalists(by_order: FloatArray, order: int) -> list[int]:
     return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
 
 
-def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
+def hidden_errors(
+    candidate: SampledCandidate, part: FloatArray, evaluations: int = _HIDDEN_EVALUATIONS
+) -> FloatArray:
     """Return the mean square error over each hidden part, the candidate fitted without it.
+
+    part: in which each sample lies, see :func:`parts`;  evaluations: of that fit
 
     Some parts lie inside the record and one at its end. Inside alone would misjudge a plant that
     drifts, because the data hold the model at both ends. No model has to run backwards.
@@ -319,12 +305,12 @@ def _hidden_errors(candidate: SampledCandidate, part: FloatArray) -> FloatArray:
     errors = []
     for samples in hidden:
         rest = replace(problem, used=problem.used & ~samples)
-        found = _refitted(rest, candidate.fit, candidate.whitened, _HIDDEN_EVALUATIONS)
+        found = refitted(rest, candidate.fit, candidate.whitened, evaluations)
         errors.append(_missed(rest, found, samples))
     return np.array(errors)
 
 
-def _plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
+def plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
     """Return the simplest of those that no other beats: not whitened, then with fewest poles.
 
     One beats another that is better in the mean by more than half a standard error of their

@@ -158,7 +158,8 @@ class Problem:
         """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
         total, place = np.zeros_like(lag), 0
         for spectrum, count in self.drives(structure):
-            part = coefficients[place : place + count]
+            # A pulse before the record has no term where there is no pole.
+            part = np.append(coefficients[place : place + count], 0.0)
             total += polynomial.polyval(self.s, part) * spectrum
             place += count
         return lag * total
@@ -167,10 +168,11 @@ class Problem:
         """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
         terms = []
         for spectrum, count in self.drives(structure):
-            terms.append(lag * spectrum)
+            term = lag * spectrum
             # One more factor each: powers of complex numbers take a logarithm.
-            for _ in range(count - 1):
-                terms.append(terms[-1] * self.s)
+            for _ in range(count):
+                terms.append(term)
+                term = term * self.s
         return np.array(terms)
 
     def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:

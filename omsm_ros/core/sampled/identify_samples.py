@@ -22,11 +22,12 @@ from omsm_ros.core.dynamics.held_equivalent import FIRST_ORDER, ZERO_ORDER, held
 from omsm_ros.core.dynamics.response_band import Band, widening, would_show
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.covariance import noise_spectrum, parameter_covariance
-from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice, choose_sampled
+from omsm_ros.core.fitting.free_run_choice import SampledCandidate, SampledChoice
 from omsm_ros.core.fitting.held_problem import coefficients
 from omsm_ros.core.identification.residual_tests import independence, whiteness
 from omsm_ros.core.sampled.band_limited import band_limited
 from omsm_ros.core.sampled.free_run import check_changes, check_input, resting_output
+from omsm_ros.core.sampled.long_record import choose_of_any_length
 from omsm_ros.core.sampled.model import BAND_LIMITED, Discrete, SampledModel
 from omsm_ros.core.sampled.verdict import (
     SAMPLED_LIMITS,
@@ -95,7 +96,7 @@ def identify_samples(
     check_changes(output[used], "output")
     if hold == BAND_LIMITED:
         return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
-    choice = choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
+    choice = choose_of_any_length(input, output, used, period, order=order, max_delay=max_delay)
     known = _Known.of(choice.chosen, choice.delay, period)
     known, factor = _no_surer(known, choice, period)
     low, high = longest_range(known.band, SAMPLED_LIMITS, _shown(known, choice.chosen))

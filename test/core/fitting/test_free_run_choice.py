@@ -120,7 +120,7 @@ def test_a_pole_more_is_taken_for_half_a_standard_error(gain, order):
         SampledCandidate(None, None, n, False, 10.0 + more) for n, more in ((1, 0.0), (2, differs))
     )
     small = replace(small, hidden=np.full(7, 10.0))
-    assert free_run_choice._plainest([small, large]).order == order
+    assert free_run_choice.plainest([small, large]).order == order
 
 
 def test_what_no_model_predicts_is_given_none():
