@@ -196,6 +196,7 @@ def parts(used: BoolArray) -> FloatArray:
 def delayed(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
 ) -> HeldProblem:
+    """Return the problem whose ``input`` (n,) comes ``delay`` samples later."""
     late = np.roll(input, delay)
     return HeldProblem(
         input=late - np.mean(late),
