@@ -57,11 +57,25 @@ class TriggerCount:
             missing = first - self._next
         end = first + length
         skip = min(max(self._next - first, 0), length)
-        late = sum(max(min(b, first + skip) - max(a, first), 0) for a, b in self._gaps)
+        late = self._filled(first, first + skip) if skip else 0
         if skip < length:
             self._next = end
             self._newest_first, self._newest_stamp_ns = first, block.stamp_ns
-        return Arrival(self._session, first, skip, min(late, skip), missing)
+        return Arrival(self._session, first, skip, late, missing)
+
+    def _filled(self, first: int, end: int) -> int:
+        """Return how many counts of ``first`` to ``end`` had been left out; they are no longer."""
+        late, left = 0, []
+        for a, b in self._gaps:
+            low, high = max(a, first), min(b, end)
+            if low < high:
+                late += high - low
+                left += [part for part in ((a, low), (high, b)) if part[0] < part[1]]
+            else:
+                left.append((a, b))
+        if late:
+            self._gaps = deque(left, maxlen=_GAPS_REMEMBERED)
+        return late
 
     def end(self) -> None:
         """Begin a session with whatever comes next."""
