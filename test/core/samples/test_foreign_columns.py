@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from omsm_ros.core.samples.blocks import Status
 from omsm_ros.core.samples.foreign_columns import (
     CHANNELS,
-    UNITS,
     Column,
     ColumnMap,
     Rows,
@@ -23,6 +22,7 @@ from omsm_ros.core.samples.foreign_columns import (
     period_of,
 )
 from omsm_ros.errors import DataError
+from omsm_ros.foreign_units import UNITS
 
 STOOD = {axis: Column("") for axis in "xybc"}
 Z = {"z": Column("Z"), **STOOD}
