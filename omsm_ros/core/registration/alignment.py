@@ -20,7 +20,7 @@ from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
 from omsm_ros.core.samples.blocks import AxisBlock, FloatArray
 from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.samples.scatter import noise_of
-from omsm_ros.errors import DataError
+from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.least_squares import least_squares, unit_columns
 from omsm_ros.readable import measured, quantity
 from omsm_ros.units import MICROMETRE_M
@@ -182,14 +182,19 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
 def _fitted(
     radius: float, misfit: _OfUnknown, jacobian: _OfUnknown, first: FloatArray
 ) -> optimize.OptimizeResult:
-    found = optimize.least_squares(misfit, first, jac=jacobian, method="lm", x_scale="jac")
-    if not found.success or _rms(found) > 0.01 * abs(radius):
-        raise DataError(
-            f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: "
-            f"{quantity(_rms(found), 'm')} rms are left; "
-            "check the radius and its sign, and that the scan covers the sphere"
-        )
-    return found
+    left = "its centre strays out of the machine"
+    try:
+        found = optimize.least_squares(misfit, first, jac=jacobian, method="lm", x_scale="jac")
+    except ConfigurationError:  # no geometry has it there
+        pass
+    else:
+        if found.success and _rms(found) <= 0.01 * abs(radius):
+            return found
+        left = f"{quantity(_rms(found), 'm')} rms are left"
+    raise DataError(
+        f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: {left}; "
+        "check the radius and its sign, and that the scan covers the sphere"
+    )
 
 
 def _rms(found: optimize.OptimizeResult) -> float:
