@@ -1,0 +1,210 @@
+"""Points in the frame of the part: distances in closed form, rigid motions, selections."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from omsm_ros.core.registration.placement import (
+    FREEDOMS,
+    LEAST_POINTS,
+    Aperture,
+    Placed,
+    Placement,
+    Portion,
+    about_the_origin,
+    freedom_columns,
+    placed,
+    selection,
+    usable,
+)
+from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.posed import Pose
+from omsm_ros.core.surface.slopes import gradient_of, unit_normal
+from omsm_ros.errors import DataError
+
+RNG = np.random.default_rng(2)
+N = 300
+X, Y = RNG.uniform(-6e-3, 6e-3, (2, N))
+OFF = RNG.normal(0, 2e-6, N)
+POSE = Pose(x=1e-3, y=-2e-3, piston=5e-4, tip=0.03, tilt=-0.05, clocking=0.9)
+
+
+def portion(points):
+    return Portion(*points, np.empty((0, points.shape[1])))
+
+
+def beside(surface, off=OFF):
+    """Points of the part that lie ``off`` [m] along its normal, (3, n)."""
+    foot = np.stack([X, Y, surface.height(X, Y)])
+    return foot + off * unit_normal(*gradient_of(surface, X, Y))
+
+
+def carried(pose, points):
+    turn = Rotation.from_euler("xyz", [pose.tip, pose.tilt, pose.clocking])
+    return turn.apply(points.T).T + pose.origin[:, np.newaxis]
+
+
+@pytest.mark.parametrize("pose", [Pose(), POSE])
+@pytest.mark.parametrize("surface", [PAPER_MIRROR, Sphere(-0.03), Toroid(0.05, -0.04), Flat(1e-4)])
+def test_points_along_the_normal_deviate_by_their_distance(surface, pose):
+    """Exact but for deviation squared times curvature: 2 µm squared over 30 mm are 0.1 nm."""
+    found = placed(surface, Placement(pose), portion(carried(pose, beside(surface))))
+    np.testing.assert_allclose(found.deviation, OFF, atol=1e-12)
+    np.testing.assert_allclose(np.stack([found.x, found.y]), beside(surface)[:2], atol=1e-16)
+    np.testing.assert_allclose(found.normal, unit_normal(*gradient_of(surface, X, Y)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), np.ones(N))
+
+
+def test_the_deviation_does_not_know_where_the_part_sits():
+    """Points and pose moved alike: nothing changes."""
+    here = placed(PAPER_MIRROR, Placement(), portion(beside(PAPER_MIRROR)))
+    there = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, beside(PAPER_MIRROR))))
+    np.testing.assert_allclose(there.deviation, here.deviation, atol=1e-17)
+    turn = Rotation.from_euler("xyz", [POSE.tip, POSE.tilt, POSE.clocking])
+    np.testing.assert_allclose(there.from_origin, turn.apply(here.from_origin.T).T, atol=1e-16)
+
+
+def test_power_is_a_bowl_that_the_nominal_does_not_have():
+    """``power r²/2`` above the surface is no deviation any more."""
+    power = 0.02
+    bowl = Sphere(0.1).height(X, Y) + power / 2 * (X**2 + Y**2)
+    found = placed(Sphere(0.1), Placement(Pose(), power), portion(np.stack([X, Y, bowl])))
+    np.testing.assert_allclose(found.deviation, np.zeros(N), atol=1e-18)
+
+
+def test_of_a_plane_moves_do_what_geometry_says():
+    """Piston lowers the points beside it, a tip those of y, a tilt raises those of x."""
+    flat = portion(np.stack([X, Y, 0 * X]))
+    columns = freedom_columns(Placement(), placed(Flat(), Placement(), flat), FREEDOMS)
+    expected = [-np.ones(N), -Y, X, 0 * X, 0 * X, 0 * X, -(X**2 + Y**2) / 2]
+    np.testing.assert_allclose(columns, expected, atol=1e-18)
+
+
+def test_of_a_sphere_a_shift_does_what_a_tilt_does_by_its_radius():
+    on_it = portion(np.stack([X, Y, Sphere(0.05).height(X, Y)]))
+    at = placed(Sphere(0.05), Placement(), on_it)
+    columns = dict(zip(FREEDOMS, freedom_columns(Placement(), at, FREEDOMS), strict=True))
+    # Turned by an angle about the vertex, the centre, R above it, moves by R times the angle.
+    np.testing.assert_allclose(columns["tilt"], 0.05 * columns["x"], atol=1e-16)
+    np.testing.assert_allclose(columns["tip"], -0.05 * columns["y"], atol=1e-16)
+    np.testing.assert_allclose(columns["clocking"], 0 * X, atol=1e-18)
+
+
+def test_columns_come_in_the_order_in_which_freedoms_are_named():
+    at = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, beside(PAPER_MIRROR))))
+    every = dict(zip(FREEDOMS, freedom_columns(Placement(POSE), at, FREEDOMS), strict=True))
+    names = ("power", "x", "piston", "clocking")
+    some = freedom_columns(Placement(POSE), at, names)
+    np.testing.assert_array_equal(some, [every[name] for name in names])
+    assert freedom_columns(Placement(POSE), at, ()).shape == (0, N)
+
+
+# Placements.
+
+
+def test_a_placement_moves_by_the_names_of_its_freedoms():
+    found = Placement(Pose(x=1e-3, tip=0.1), 0.5).moved(
+        ("tip", "power", "clocking"), np.array([0.05, -0.2, 0.3])
+    )
+    values = [found.value(name) for name in FREEDOMS]
+    assert values == pytest.approx([0.0, 0.15, 0.0, 1e-3, 0.0, 0.3, 0.3])
+    back = found.moved(("tip", "power", "clocking"), np.array([-0.05, 0.2, -0.3]))
+    assert back.value("tip") == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("name", "step"), [("x", 20.0), ("tip", 4.0), ("piston", np.nan)])
+def test_a_fit_that_strays_is_told_with_what_to_check(name, step):
+    with pytest.raises(DataError, match=r"no pose brings the points .* sign of its radii"):
+        Placement().moved([name], np.array([step]))
+
+
+# Apertures.
+
+
+def test_an_aperture_holds_its_rim_even_in_float32():
+    disc = Aperture(5e-3, 1e-3, -2e-3)
+    angle = np.linspace(0, 2 * np.pi, 50)
+    rim = np.stack([1e-3 + 5e-3 * np.cos(angle), -2e-3 + 5e-3 * np.sin(angle)])
+    assert np.all(disc.holds(*rim))
+    assert np.all(disc.holds(*rim.astype(np.float32).astype(float)))
+    centre = np.array([[1e-3], [-2e-3]])
+    assert not np.any(disc.holds(*(centre + 1.001 * (rim - centre))))
+    u, v = disc.scaled(*rim)
+    np.testing.assert_allclose(np.hypot(u, v), np.ones(50))
+
+
+def test_points_beyond_the_aperture_or_the_surface_do_not_count():
+    x, y = RNG.uniform(-0.03, 0.03, (2, 4000))
+    z = np.where(np.hypot(x, y) < 0.02, Sphere(0.02).height(x, y), 0.0)
+    at = placed(Sphere(0.02), Placement(), portion(np.stack([x, y, z])))
+    whole = usable(at, None)
+    assert np.all(np.hypot(whole.x, whole.y) < 0.02)
+    inner = usable(at, Aperture(0.01))
+    assert len(inner.x) == np.sum(np.hypot(x, y) <= 0.01)
+    assert inner.normal.shape == inner.from_origin.shape == (3, len(inner.x))
+    np.testing.assert_allclose(inner.deviation, np.zeros(len(inner.x)), atol=1e-15)
+
+
+@pytest.mark.parametrize("count", [LEAST_POINTS - 1, LEAST_POINTS])
+def test_as_many_points_as_the_fit_needs_are_enough(count):
+    on_it = np.stack([X[:count], Y[:count], 0 * X[:count]])
+    at = placed(Flat(), Placement(), portion(on_it))
+    if count == LEAST_POINTS:
+        assert len(usable(at, None).x) == count
+        return
+    with pytest.raises(DataError, match="199 points lie on the nominal surface, expected 200"):
+        usable(at, None)
+
+
+def placed_at(x, y):
+    nothing = np.zeros((3, len(x)))
+    return Placed(x, y, 0 * x, nothing, nothing)
+
+
+def test_about_the_origin_is_the_disc_that_holds_all_points():
+    found = about_the_origin(placed_at(X, Y))
+    assert (found.x, found.y) == (0.0, 0.0)
+    assert found.radius == np.hypot(X, Y).max()
+
+
+@pytest.mark.parametrize("away", [(0.1, 0.0), (0.0, -0.2), (0.3, 0.4)])
+def test_a_part_beside_the_origin_has_a_disc_of_its_own(away):
+    found = about_the_origin(placed_at(X + away[0], Y + away[1]))
+    assert abs(found.x - away[0]) < 3e-4
+    assert abs(found.y - away[1]) < 3e-4
+    assert np.all(found.holds(X + away[0], Y + away[1]))
+    assert found.radius < 9e-3
+
+
+def test_a_single_place_has_a_disc_too():
+    assert about_the_origin(placed_at(np.zeros(3), np.zeros(3))).radius == 1.0
+
+
+# Selections.
+
+
+@pytest.mark.parametrize("cut", [1, 7, 1000])
+def test_a_selection_does_not_know_how_the_points_came(cut):
+    points = RNG.normal(size=(3, 1000))
+    portions = [portion(points[:, k : k + cut]) for k in range(0, 1000, cut)]
+    found = selection(lambda: portions, 300)
+    np.testing.assert_array_equal(np.stack(found[:3]), points[:, ::4])
+    assert found.systematic.shape == (0, 250)
+
+
+def test_nothing_to_select_from_is_refused():
+    with pytest.raises(DataError, match="0 points: there is nothing to register"):
+        selection(list, 100)
+
+
+def test_a_shape_with_aspheric_terms_is_met_along_its_normal_too():
+    """By the nearest of many points of its profile, without slopes."""
+    surface = Asphere(0.02, -0.5, (0.0, 3e3))
+    point = np.array([[4e-3], [0.0], [float(surface.height(4e-3, 0.0)) + 3e-6]])
+    r = 4e-3 + np.linspace(-3e-6, 3e-6, 20_001)
+    away = np.hypot(r - point[0], surface.height(r, 0 * r) - point[2])
+    found = placed(surface, Placement(), portion(point)).deviation
+    assert found[0] == pytest.approx(away.min(), abs=2e-11)
