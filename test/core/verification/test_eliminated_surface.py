@@ -163,7 +163,7 @@ def test_scores_are_sums_over_whole_rings() -> None:
     scale = np.sqrt(np.maximum(np.diag(meat), 1e-300))
     found = seen.meat()
     assert np.allclose(found / np.outer(scale, scale), meat / np.outer(scale, scale), atol=1e-9)
-    assert seen.square == pytest.approx(float(noise @ noise), rel=1e-12)
+    assert seen.square == pytest.approx(float(noise @ noise), rel=1e-12, abs=0)
 
 
 def test_what_the_surface_does_is_no_residual() -> None:
@@ -192,7 +192,7 @@ def test_heights_follow_the_four_parameters_as_their_columns_say() -> None:
     # ε d = ε (S - H(z)): the surface's own part of it is no longer in the fit.
     four[:, GAIN] += ROWS @ surface
     variance = np.einsum("np,pq,nq->n", four, covariance, four)
-    assert seen.followed(covariance) == pytest.approx(np.sqrt(np.mean(variance)), rel=1e-9)
+    assert seen.followed(covariance) == pytest.approx(np.sqrt(np.mean(variance)), rel=1e-9, abs=0)
     assert seen.followed(0 * covariance) == 0.0
 
 
