@@ -67,6 +67,7 @@ def test_what_was_saved_is_loaded(model, tmp_path):
         (("continuous", "delay"), 1001.0, "at most 10000 samples"),
         (("continuous", "delay"), -1.0, "delay"),
         (("continuous", "denominator"), [2.0], "expected 1"),
+        (("continuous", "denominator"), [1.0, 1e300, 1e-300], "cannot be computed"),
         (("sample_period",), 1e-15, "sample period"),
         (("valid_up_to",), -1.0, "frequency"),
         (("working_point",), [1.0], "working_point"),
@@ -86,3 +87,21 @@ def test_what_is_no_model_is_refused_by_name(place, value, says, tmp_path):
     with pytest.raises(CalibrationError, match=says) as refusal:
         load_model(path)
     assert str(path) in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("denominator", [1.0, -1e-9, 0.02]),
+        ("denominator", [1.0, 0.0, 0.02]),
+        ("numerator", [0.0, 0.0]),
+    ],
+)
+def test_a_smooth_model_that_cannot_run_is_refused(name, value, tmp_path):
+    """Its output would grow without end, or it has none."""
+    content = SMOOTH.content()
+    content["continuous"][name] = value
+    path = tmp_path / "m.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(CalibrationError, match="no stable response, or none at all"):
+        load_model(path)

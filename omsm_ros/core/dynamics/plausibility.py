@@ -43,8 +43,8 @@ def check_dynamics(dynamics: TransferFunction, sample_period: float) -> None:
         )
     DELAY.checked(dynamics.delay, CalibrationError)
     _check_samples("delay", dynamics.delay, sample_period, MAX_DELAY_SAMPLES)
-    poles = _roots(dynamics, "poles")
-    for roots in (poles, _roots(dynamics, "zeros")):
+    poles = checked_roots(dynamics, "poles")
+    for roots in (poles, checked_roots(dynamics, "zeros")):
         for rate in abs(roots):
             TIME_CONSTANT.checked(_inverse(rate), CalibrationError, "time constant of G_m")
     if len(poles):
@@ -108,7 +108,11 @@ def _check_samples(name: str, seconds: float, sample_period: float, most: int) -
         )
 
 
-def _roots(dynamics: TransferFunction, kind: str) -> ComplexArray:
+def checked_roots(dynamics: TransferFunction, kind: str) -> ComplexArray:
+    """Return the ``kind`` of ``dynamics``, "poles" or "zeros" [rad/s].
+
+    Raises CalibrationError where they cannot be computed.
+    """
     with np.errstate(all="ignore"):
         try:
             roots = dynamics.poles() if kind == "poles" else dynamics.zeros()
@@ -116,8 +120,8 @@ def _roots(dynamics: TransferFunction, kind: str) -> ComplexArray:
             roots = np.array([np.nan + 0j])
     if not np.all(np.isfinite(roots)):
         raise CalibrationError(
-            f"the {kind} of G_m cannot be computed: its coefficients span too many decades; "
-            "identify it again"
+            f"the {kind} of the response cannot be computed: its coefficients span too many "
+            "decades; identify it again"
         )
     return roots
 

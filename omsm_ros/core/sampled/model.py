@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.dynamics.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
+from omsm_ros.core.dynamics.plausibility import checked_roots
 from omsm_ros.core.dynamics.response_band import Band
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.samples.blocks import FloatArray
@@ -116,6 +117,8 @@ class SampledModel:
                 f"model with hold {content['hold']!r}: a held input needs a discrete model, "
                 "a band-limited one a continuous one with its covariance; identify it again"
             )
+        if content["hold"] == BAND_LIMITED and continuous is not None:
+            _check_runs(continuous)
         valid = [FREQUENCY.checked(content[f"valid_{end}"], CalibrationError) for end in _ENDS]
         point = [SIGNAL.checked(value, CalibrationError) for value in content["working_point"]]
         return cls(
@@ -158,10 +161,22 @@ def _continuous_of(
         )
     except OmsmError as err:
         raise CalibrationError(str(err)) from err
+    for kind in ("poles", "zeros"):
+        checked_roots(dynamics, kind)
     if content["covariance"] is None:
         return dynamics, None
     size = len(dynamics.numerator) + len(dynamics.denominator)
     return dynamics, _square(content["covariance"], size)
+
+
+def _check_runs(dynamics: TransferFunction) -> None:
+    """Raise CalibrationError for what cannot run freely; of a held input ``discrete`` does."""
+    if not dynamics.is_stable or not np.any(dynamics.numerator):
+        raise CalibrationError(
+            f"numerator {dynamics.numerator.tolist()!r}, denominator "
+            f"{dynamics.denominator.tolist()!r} in s is no stable response, or none at all; "
+            "identify it again"
+        )
 
 
 def _discrete_of(content: Mapping[str, Any]) -> Discrete:
