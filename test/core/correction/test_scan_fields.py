@@ -79,3 +79,57 @@ def test_turns_that_the_points_leap_over_are_seen() -> None:
     assert resolves_turns(points)
     assert resolves_turns(replace(points, c=points.c % (2 * np.pi)))
     assert not resolves_turns(spiral_points(150))
+
+
+def waves(*sizes: float) -> np.ndarray:
+    """Rows of whole waves, uncorrelated, of which each has the rms ``size``."""
+    place = 2 * np.pi * np.arange(1200) / 1200
+    rows = [np.sqrt(2) * size * np.sin((k + 1) * place) for k, size in enumerate(sizes)]
+    return np.array(rows)
+
+
+def test_only_what_counts_among_all_is_left_of_a_source() -> None:
+    """One of 400 beside two of 1 and 0.2: the last has a millionth of the variance."""
+    found = scan_fields({"drift": waves(400.0), "tilt": waves(1.0, 0.2)}, 1)
+    assert found.names == ("drift", "tilt")
+    np.testing.assert_allclose(np.abs(found.fields[1]), np.abs(waves(1.0)[0]), atol=1e-9)
+    alone = scan_fields({"tilt": waves(1.0, 0.2)}, 1)
+    assert alone.names == ("tilt", "tilt")
+
+
+def test_a_calibration_of_which_nothing_counts_is_left_out_as_a_whole() -> None:
+    small, large = {"dynamics": waves(1e-4, 1e-5)}, {"dynamics": waves(1.0, 1e-5)}
+    beside = {"drift": waves(1.0)}
+    assert scan_fields(beside | small, 1).aligned == ()
+    assert scan_fields(beside | small, 1).names == ("drift",)
+    # But with one that counts the others stay, in their order.
+    found = scan_fields(large | beside, 1)
+    assert found.names == ("dynamics", "dynamics", "drift")
+    assert found.aligned == ("dynamics",)
+    np.testing.assert_array_equal(found.fields[:2], large["dynamics"])
+
+
+def test_upper_bounds_are_those_of_the_sources_that_are_left() -> None:
+    every = {"lateral_lag": waves(1.0), "drift": waves(2.0), "tilt": waves(1e-9)}
+    found = scan_fields(every, 1, bounds=("tilt", "lateral_lag", "beam"))
+    assert found.bounds == ("lateral_lag",)
+
+
+def test_unit_sign_and_order_of_the_fields_do_not_matter() -> None:
+    every = {"drift": waves(2.0, 1.0), "tilt": waves(0.5)}
+    plain = scan_fields(every, 1)
+    turned = scan_fields({name: -1e-9 * rows[::-1] for name, rows in every.items()}, 1)
+    for name in every:
+        one, other = (
+            np.sum(f.fields[[n == name for n in f.names]] ** 2, axis=0) for f in (plain, turned)
+        )
+        np.testing.assert_allclose(other, 1e-18 * one, rtol=1e-6, atol=1e-30)
+
+
+def test_between_two_points_a_field_is_a_straight_line() -> None:
+    found = scan_fields({"could_hide": np.array([[0.0, 4.0, 2.0]])}, 4)
+    assert found.at(0, 12)[0].tolist() == [0, 1, 2, 3, 4, 3.5, 3, 2.5, 2, 2, 2, 2]
+    assert found.at(3, 2)[0].tolist() == [3, 4]
+    one = scan_fields({"could_hide": np.array([[7.0]])}, 4)
+    # A single point has no scatter, so nothing of it counts as one.
+    assert one.at(0, 3).shape[1] == 3
