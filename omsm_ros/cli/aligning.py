@@ -16,6 +16,10 @@ from omsm_ros.readable import measured, quantity
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.machine_files import save_geometry
 
+_NO_SPHERE = (
+    "most of the residual is no noise: this is no sphere of that radius, or its form or the "
+    "probe's error on slopes is as large; the centre may be worse than stated"
+)
 # Beyond it nine tenths of the mean square are something else than noise.
 _NOT_NOISE = 3.0
 
@@ -45,6 +49,7 @@ def _align(args: argparse.Namespace) -> Facts:
         "uncertainty": dict(zip(names, spread, strict=True)),
         "residual": found.residual,
         "scatter": found.scatter,
+        "warnings": [_NO_SPHERE] * (found.residual > _NOT_NOISE * found.scatter),
         "beam_found": found.beam_found,
         "used": found.used,
         "samples": account.as_dict(),
@@ -62,14 +67,7 @@ def _show_align(facts: Facts) -> None:
         )
     residual, scatter = (quantity(facts[name], "m") for name in ("residual", "scatter"))
     rows.append(("residual", f"{residual} rms, of which noise {scatter}"))
-    if facts["residual"] > _NOT_NOISE * facts["scatter"]:
-        rows.append(
-            (
-                "warning",
-                "most of the residual is no noise: this is no sphere of that radius, or its form "
-                "or the probe's error on slopes is as large; the centre may be worse than stated",
-            )
-        )
+    rows += [("warning", warning) for warning in facts["warnings"]]
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
     table([*rows, written([facts["file"]])])

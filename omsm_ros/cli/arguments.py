@@ -141,7 +141,12 @@ def add_by_stamps(sub: argparse.ArgumentParser) -> None:
 
 
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
-    """Return what is stated of the counters."""
+    """Return what is stated of the counters; ConfigurationError where none are used."""
+    stated = (args.counter_offset, args.stamp_tolerance) != (0, TWO_DRIVERS_S)
+    if args.by_stamps and stated:
+        raise ConfigurationError(
+            "--by-stamps uses no counters; leave out --counter-offset and --stamp-tolerance, or it"
+        )
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)
 
 

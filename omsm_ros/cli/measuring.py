@@ -117,17 +117,29 @@ def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
     )
 
 
-def _correct(args: argparse.Namespace) -> Facts:
-    calibration = load_calibration(args.calibration)
-    nominal = load_surface(args.nominal) if args.nominal else None
-    if args.fit and nominal is None:
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise ConfigurationError for options that need others."""
+    if args.fit and args.nominal is None:
         raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
-    if args.lateral and nominal is None:
+    if args.lateral and args.nominal is None:
         raise ConfigurationError(
             "--lateral costs height by the slope of the surface; give --nominal SURFACE.yaml"
         )
     if args.tolerance and not args.fit:
         raise ConfigurationError("--tolerance needs a deviation to judge; give --fit auto")
+    if args.aperture and not args.fit:
+        raise ConfigurationError("--aperture is the disc that is fitted; give --fit auto")
+    if (args.delay or args.exposure) and not args.by_stamps:
+        raise ConfigurationError(
+            "--delay and --exposure shift stamps, which counters do without; give --by-stamps, or "
+            "leave them out"
+        )
+
+
+def _correct(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    nominal = load_surface(args.nominal) if args.nominal else None
+    _check_options(args)
     options = CorrectionOptions(
         polarity=args.polarity,
         accept_other_rate=args.override,

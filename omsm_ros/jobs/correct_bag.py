@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.uncertainty import with_lateral
 from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.machine.pitch_curve import PitchCurve
 from omsm_ros.core.machine.scan_path import PathStart, ScanPath
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
@@ -27,6 +29,7 @@ from omsm_ros.jobs.corrected_scan import Admission, ByStamps, CorrectedScan
 from omsm_ros.jobs.lateral_errors import LateralErrors, add_lateral_errors
 from omsm_ros.jobs.progress import Progress, no_progress
 from omsm_ros.jobs.read_bag import MOST_JUDGED
+from omsm_ros.readable import quantity
 from omsm_ros.storage.cloud_file import PlyWriter
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -118,6 +121,7 @@ class _Findings:
     def __init__(self, nominal: Surface | None, by_counter: bool) -> None:
         self._nominal, self._by_counter = nominal, by_counter
         self._axes, self._distance = StreamWatch(), StreamWatch()
+        self._z = (np.inf, -np.inf)
         names = ("error",) if nominal is None else ("error", "raw", "corrected")
         self._running = {name: RunningStatistics() for name in names}
         self.largest = 0.0
@@ -128,6 +132,9 @@ class _Findings:
         if block is None:
             return
         self.path.add(block)
+        if isinstance(block, AxisBlock) and np.any(here := np.isfinite(block.z)):
+            low, high = self._z
+            self._z = (min(low, block.z[here].min()), max(high, block.z[here].max()))
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
@@ -139,7 +146,19 @@ class _Findings:
             found += skew_fault(skew, scan.sample_period, scan.trigger)
             samples = scan.account.distance.counted.get("slipped", 0)
             found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)
-        return tuple(found)
+        return (*found, *self._beyond(scan.options.pitch))
+
+    def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:
+        """Yield where Z went beyond what was measured of its pitch."""
+        if pitch is None:
+            return
+        (low, high), first, last = self._z, pitch.position[0], pitch.position[-1]
+        if low < first or last < high:
+            yield (
+                f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, its pitch was "
+                f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as level "
+                "beyond; measure it where Z goes"
+            )
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
         self.drawn.add(packed)

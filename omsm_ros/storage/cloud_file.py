@@ -83,7 +83,10 @@ class CloudFile:
         self._path = Path(path)
         with self._opened() as stream:
             head = stream.read(_PLY_HEADER_BYTES)
-            held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
+            try:
+                held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
+            except OSError as err:  # what the kernel writes as it is read, as in /proc
+                raise FileError(f"{str(path)!r} has no length; give a file on a disk") from err
         self.points = max(held, 0) // _PLY_DTYPE.itemsize
         lines = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
         if lines != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:

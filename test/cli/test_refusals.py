@@ -156,3 +156,33 @@ def test_a_file_in_the_way_of_a_folder_is_named(
     assert "'file' is in the way, no folder" in said
     assert "File exists" not in said
     assert (tmp_path / "file").read_text() == "in the way"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--delay", "1e-3"], "give --by-stamps"),
+        (["--exposure", "1e-3"], "give --by-stamps"),
+        (["--aperture", "0.01"], "give --fit auto"),
+        (["--by-stamps", "--counter-offset", "1"], "leave out --counter-offset"),
+        (["--by-stamps", "--stamp-tolerance", "1e-3"], "leave out --counter-offset"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(capsys, tmp_path, calibration, options, said):
+    words = ["correct", "s.mcap", "--calibration", calibration, "--out", tmp_path / "r"]
+    assert said in refused(capsys, *words, *options)
+
+
+def test_a_file_without_a_length_is_no_cloud(capsys, tmp_path):
+    assert "/proc/cpuinfo" in refused(
+        capsys, "export", "/proc/cpuinfo", "--out", tmp_path / "a.csv"
+    )
+
+
+def test_limits_in_another_unit_are_refused(capsys, tmp_path, calibration):
+    (tmp_path / "m.csv").write_text("time_s,z_m\n" + "".join(f"{k / 1e3},0\n" for k in range(99)))
+    (tmp_path / "l.yaml").write_text("probe_range: 100.0  # micrometres\n")
+    words = ("--calibration", calibration, "--limits", tmp_path / "l.yaml")
+    said = refused(capsys, "predict", tmp_path / "m.csv", *words)
+    assert "probe_range is 100.0 m" in said
+    assert "give it in metres" in said

@@ -144,6 +144,31 @@ def test_align_refuses_another_sphere_and_names_its_radius(capsys, tmp_path, cal
     assert not (tmp_path / "geometry.yaml").exists()
 
 
+def test_align_warns_programs_too_of_a_form_that_is_no_noise(capsys, tmp_path, calibration):
+    part = Sphere(SPHERE_RADIUS_M)
+    scan = record(Cell(), Spiral(part, 2e-3, 8e-4, 30.0), part)
+    rippled = scan.distance.distance + 100e-9 * np.sin(40 * scan.axes.c)
+    distance = replace(scan.distance, distance=rippled)
+    bag = write(tmp_path / "s.mcap", replace(scan, distance=distance))
+    words = ("--calibration", calibration, "--radius", SPHERE_RADIUS_M, "--out", tmp_path / "g")
+    (warning,) = facts(capsys, "align", bag, *words)["warnings"]
+    assert "no sphere of that radius, or its form" in warning
+
+
+def test_a_pitch_that_was_measured_elsewhere_is_told(capsys, tmp_path, scan_bag, calibration):
+    (tmp_path / "g.yaml").write_text("abbe_arm: 0.05\n")
+    words = ["correct", scan_bag, "--calibration", calibration, "--geometry", tmp_path / "g.yaml"]
+    told = {}
+    for name, low, high in (("here", -0.1, 0.1), ("elsewhere", 5.0, 6.0)):
+        table = tmp_path / f"{name}.csv"
+        table.write_text(f"z_m,pitch_rad\n{low},1e-6\n{high},2e-6\n")
+        out = ["--out", tmp_path / name, "--no-report", "--pitch", table]
+        reasons = facts(capsys, *words, *out)["light"]["reasons"]
+        told[name] = [r["what"] for r in reasons if "pitch was measured" in r["what"]]
+    assert told["here"] == []
+    assert "from 5.00 m to 6.00 m" in told["elsewhere"][0]
+
+
 @pytest.mark.parametrize(
     "text", ["centre_x: far\n", "radius: 1.0\n", "centre_x: .nan\n", "[1, 2]\n", "1: 2\n"]
 )

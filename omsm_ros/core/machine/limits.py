@@ -29,7 +29,18 @@ _PRECISION = 1e-4
 # Of what is allowed: a path that does not move has no logarithm.
 _TINY = 1e-12
 
-_DECLARED = Quantity("limit", "", 1e-12, 1e12, "give it in the unit of its name")
+# One written in another unit, such as a range of 100 for micrometres, shall not bind nowhere.
+_DECLARED = {
+    "servo_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
+    "probe_range": Quantity("limit", "m", 1e-9, 1.0, "give it in metres"),
+    "spindle_speed_rpm": Quantity("limit", "rpm", 1e-3, 1e6, "give it in turns a minute"),
+    "motion_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
+    "z_acceleration": Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²"),
+    "z_jerk": Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³"),
+    "point_spacing": Quantity("limit", "m", 1e-10, 1.0, "give it in metres"),
+    "exposure": Quantity("limit", "s", 1e-9, 10.0, "give it in seconds"),
+    "timing": Quantity("limit", "s", 1e-15, 1.0, "give it in seconds"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +66,9 @@ class MachineLimits:
     timing: float | None = None
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
+        for name, declared in _DECLARED.items():
             if (value := getattr(self, name)) is not None:
-                _DECLARED.checked(value, ConfigurationError, name)
+                declared.checked(value, ConfigurationError, name)
 
 
 @dataclass(frozen=True, slots=True)

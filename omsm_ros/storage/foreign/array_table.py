@@ -22,6 +22,7 @@ from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.storage.files import open_regular, said
 from omsm_ros.storage.foreign.table import PIECE_ROWS, ForeignTable
+from omsm_ros.storage.foreign.trial import survives
 from omsm_ros.storage.hdf5_walk import walked
 
 # What is loaded whole: archives of NumPy, MATLAB's own files.
@@ -90,10 +91,20 @@ class ArrayTable(ForeignTable):
                 return self._hdf5()
             if head == b"MATLAB 5.0":
                 self._check_unpacked(_unpacked_matlab(stream))
-        with warnings.catch_warnings():  # complex numbers would lose a part without a word
-            warnings.simplefilter("error", np.exceptions.ComplexWarning)
-            loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
-        return loaded
+
+        def load() -> Mapping[str, Any]:
+            with warnings.catch_warnings():  # complex numbers would lose a part without a word
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                warnings.simplefilter("error", UserWarning)  # and orders of bytes be guessed
+                loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
+            return loaded
+
+        if not survives(load):
+            raise FileError(
+                f"{self} cannot be read: what it holds does not fit together; write it again, or "
+                "as CSV"
+            )
+        return load()
 
     def _check_unpacked(self, size: int) -> None:
         """Raise FileError for an archive that holds far more bytes than any recording would."""
