@@ -1,13 +1,11 @@
 """Where a line would be in another scan: places by folding written out, and what would show it."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from even_scans import NM, folded, line, scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.spectra.coordinates import Coordinate
 from omsm_ros.core.spectra.hypotheses import (
     HIGHEST_SYNCHRONOUS,
     PART,
@@ -24,56 +22,7 @@ from omsm_ros.core.spectra.hypotheses import (
     spread_of,
     whole_order,
 )
-from omsm_ros.core.spectra.line import Line
-from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
-
-NM = 1e-9
-ENDS = np.array([0, 1])
-
-
-def scan(
-    rate=1000.0, pace=0.04, turning=0.5, seconds=20.0, lines=(), path_like=TIME, sigma=0.1 * NM
-):
-    """An even scan: ``pace`` [m/s] along the path, ``turning`` [turns/s], so many ``seconds``."""
-    ends = np.array([0.0, seconds])
-
-    def coordinate(name, speed, like, highest):
-        return Coordinate(name, speed * ends, speed, like, highest)
-
-    coordinates = {
-        TIME: coordinate(TIME, 1.0, TIME, rate / 2),
-        PATH: coordinate(PATH, pace, path_like, rate / 2 / pace),
-        TURN: coordinate(TURN, turning, TIME, rate / 2 / turning),
-        RADIUS: coordinate(RADIUS, 1e-4 * turning, TIME, rate / 2 / (1e-4 * turning)),
-    }
-    count = round(seconds * rate)
-    # Looked at are its rate, its turns and how many samples it has.
-    few, at = (np.arange(count), np.zeros(count)) if path_like == PATH else (ENDS, np.zeros(2))
-    turn = np.linspace(0.0, turning * seconds, len(few))
-    signal = ScanSignal(
-        name="A", period=1 / rate, sample=few, height=at, path=at, radius=at, turn=turn
-    )
-    return SimpleNamespace(
-        signal=signal,
-        coordinates=coordinates,
-        lines=tuple(lines),
-        formless=SimpleNamespace(degree=2),
-        spectrum=SimpleNamespace(sigma_at=lambda frequency: sigma, noise=5 * NM),
-        resolution=lambda name: coordinates[name].resolution,
-    )
-
-
-def line(frequency, amplitude=5 * NM, uncertainty=1e-4, coordinate=TIME, **possible):
-    return Line(
-        coordinate=coordinate, frequency=frequency, cosine=amplitude, sine=0.0,
-        frequency_uncertainty=uncertainty, possible={coordinate: frequency, **possible},
-    )  # fmt: skip
-
-
-def folded(frequency, rate):
-    """The lowest frequency with the same samples, by looking at all its images."""
-    images = [abs(frequency - k * rate) for k in range(int(frequency / rate) + 2)]
-    return min(images)
+from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN
 
 
 class TestWhatALineMayBe:
@@ -138,7 +87,7 @@ class TestPlaces:
         assert place.coordinate == TIME
         assert place.frequency == pytest.approx(folded(waves * pace, rate), abs=1e-6 * rate)
         assert place.folded == (waves * pace > rate / 2)
-        assert 0 <= place.frequency <= rate / 2
+        assert 0 <= place.frequency <= (0.5 + 1e-9) * rate
 
     @pytest.mark.parametrize(
         ("kind", "coordinate", "frequency", "seen"),

@@ -1,0 +1,74 @@
+"""Studied scans at an even pace and the lines in them, as numbers: no heights, so in no time.
+
+What is on the part, shakes or turns with the spindle is seen where folding puts it, by looking at
+all images.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from omsm_ros.core.spectra.coordinates import Coordinate
+from omsm_ros.core.spectra.line import Line
+from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+
+NM = 1e-9
+
+
+def scan(
+    rate=1000.0, pace=0.04, turning=0.5, seconds=20.0, lines=(), path_like=TIME, sigma=0.1 * NM,
+    feed=1e-4, name="A", felt=None, on_circle=False,
+):  # fmt: skip
+    """``pace`` [m/s] along the path, ``turning`` [turns/s], ``feed`` [m/turn], so many ``seconds``.
+
+    sigma: of the amplitude of a line [m]
+    """
+    ends = np.array([0.0, seconds])
+
+    def coordinate(name, speed, like, highest):
+        return Coordinate(name, speed * ends, speed, like, highest)
+
+    coordinates = {
+        TIME: coordinate(TIME, 1.0, TIME, rate / 2),
+        PATH: coordinate(PATH, pace, path_like, rate / 2 / pace),
+        TURN: coordinate(TURN, turning, TIME, rate / 2 / turning),
+        RADIUS: coordinate(RADIUS, feed * turning, TIME, rate / 2 / (feed * turning)),
+    }
+    count = round(seconds * rate)
+    # Looked at are its rate, its turns and how many samples it has.
+    few = np.arange(count) if path_like == PATH else np.array([0, count - 1])
+    at, turn = np.zeros(len(few)), np.linspace(0.0, turning * seconds, len(few))
+    return SimpleNamespace(
+        signal=ScanSignal(
+            name=name, period=1 / rate, sample=few, height=at, path=at, radius=at, turn=turn
+        ),
+        coordinates=coordinates,
+        lines=tuple(lines),
+        formless=SimpleNamespace(degree=2, on_circle=on_circle),
+        spectrum=SimpleNamespace(sigma_at=lambda frequency: sigma, noise=5 * NM),
+        resolution=lambda name: coordinates[name].resolution,
+        felt=felt,
+    )
+
+
+def line(frequency, amplitude=5 * NM, uncertainty=1e-4, coordinate=TIME, **possible):
+    """Of so many waves a unit of ``coordinate``, and of others in which it may be one."""
+    return Line(
+        coordinate=coordinate, frequency=frequency, cosine=amplitude, sine=0.0,
+        frequency_uncertainty=uncertainty, possible={coordinate: frequency, **possible},
+    )  # fmt: skip
+
+
+def folded(frequency, rate):
+    """The lowest frequency with the same samples, by looking at all its images."""
+    return min(abs(frequency - k * rate) for k in range(int(frequency / rate) + 2))
+
+
+def seen_by(one, over, frequency, amplitude=5 * NM):
+    """The line that a wave over t, s, r or c makes in an even scan."""
+    name = {"t": TIME, "s": PATH, "r": RADIUS, "c": TURN}[over]
+    in_time = frequency * one.coordinates[name].pace
+    if over != "t":  # a sample averages over its period
+        amplitude *= abs(np.sinc(in_time * one.signal.period))
+    at = folded(in_time, one.signal.rate)
+    return line(at, amplitude, **{n: at / one.coordinates[n].pace for n in (PATH, TURN, RADIUS)})
