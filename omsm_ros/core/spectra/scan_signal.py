@@ -25,7 +25,7 @@ _STRETCHES = 200
 class ScanSignal:
     """A scan, each array (n,), in the order of time; samples without a reading are not in it.
 
-    period: of the trigger [s];  sample: its count from the first reading
+    period: from reading to reading where none is lost [s];  sample: their count from the first
     height: of the surface [m];  path: how far the probe has gone over the part [m]
     radius: from the spindle axis [m];  turn: of the spindle [turns]
     """
@@ -97,12 +97,14 @@ def scan_signal(
             f"scan {name!r} has {len(sample)} readings between the trigger numbers of its "
             f"positions, expected {_LEAST_POINTS} or more; record both from the same triggers"
         )
+    # Read at every other trigger, a line would be two: itself and its image within half the rate.
+    every = int(np.gcd.reduce(np.diff(sample)))
     columns = (track(x, y, turn), np.hypot(x, y), turn)
     path, radius, turn = (np.interp(sample, count, values) for values in columns)
     return ScanSignal(
         name=name,
-        period=period,
-        sample=sample - sample[0],
+        period=every * period,
+        sample=(sample - sample[0]) // every,
         height=height,
         path=path,
         radius=radius,
@@ -119,7 +121,8 @@ def counted_on(count: IntArray, angle: FloatArray) -> FloatArray:
     step, gap = np.diff(angle), np.diff(count)
     if np.ptp(angle) > 2 * np.pi * 1.001 or not np.any(abs(step) > np.pi):
         return angle
-    pace = np.median(np.remainder(step[gap == 1] + np.pi, 2 * np.pi) - np.pi)
+    next_ones = gap == np.min(gap)
+    pace = np.median(np.remainder(step[next_ones] + np.pi, 2 * np.pi) - np.pi) / np.min(gap)
     expected = pace * gap
     whole = np.rint((step - expected) / (2 * np.pi)) * 2 * np.pi
     return np.asarray(np.r_[angle[0], angle[0] + np.cumsum(step - whole)])

@@ -5,6 +5,7 @@ import pytest
 
 from omsm_ros.core.spectra.band_stop import band_stop
 from omsm_ros.core.spectra.felt import FeltLine, felt
+from omsm_ros.core.spectra.lines import find_lines
 from omsm_ros.core.spectra.scan_signal import (
     PATH,
     RADIUS,
@@ -123,6 +124,34 @@ class TestScan:
         found = self.scan(EVERY, EVERY, x)
         np.testing.assert_allclose(found.radius, 5e-3 + 1e-6 * EVERY, rtol=1e-9)
         np.testing.assert_allclose(found.path, 1e-6 * EVERY, rtol=1e-6, atol=1e-12)
+
+    @pytest.mark.parametrize("every", [2, 5])
+    def test_read_at_every_other_trigger_it_is_a_scan_at_half_the_rate(self, every):
+        """Also where some of those readings are lost, and the spindle starts anew each turn."""
+        count = np.arange(0, 5 * COUNT, every)
+        count = np.delete(count, [7, 300, 301, 302])
+        angle = 2 * np.pi * 0.35 * count * 1e-3
+        still = np.zeros(len(count))
+        slow = scan_signal(
+            "A",
+            1e-3,
+            (count, np.sin(count)),
+            (count, 5e-3 + still, still, np.remainder(angle, 2 * np.pi)),
+        )
+        assert slow.rate == pytest.approx(1000.0 / every)
+        np.testing.assert_array_equal(slow.sample, count // every)
+        np.testing.assert_allclose(slow.time, count * 1e-3)
+        np.testing.assert_allclose(slow.turn, angle / 2 / np.pi, atol=1e-9)
+        np.testing.assert_allclose(slow.path, 5e-3 * angle, rtol=1e-9, atol=1e-12)
+
+    def test_a_line_of_such_a_scan_is_one_line(self):
+        count = np.arange(0, 2 * COUNT, 2)
+        height = 5e-9 * np.sin(2 * np.pi * 60.0 * 1e-3 * count)
+        height = height + np.random.default_rng(1).normal(0, 1e-9, COUNT)
+        signal = scan_signal("A", 1e-3, (count, height), (count, STILL, STILL, STILL))
+        (line,) = find_lines(signal, signal.height).lines
+        assert line.frequency == pytest.approx(60.0, abs=1e-3)
+        assert line.amplitude == pytest.approx(5e-9, rel=0.02)
 
     def test_readings_before_and_after_the_positions_are_left_out(self):
         found = self.scan(EVERY, EVERY[500:3001], 5e-3 + 1e-6 * EVERY[500:3001])
