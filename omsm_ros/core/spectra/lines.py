@@ -231,7 +231,7 @@ def _judged(
                     line,
                     amplitude_uncertainty=variance**0.5,
                     # Cramér-Rao for a line in white noise over an even range.
-                    frequency_uncertainty=np.sqrt(3 / ratio) / np.pi * coordinate.resolution,
+                    frequency_uncertainty=np.sqrt(1.5 / ratio) / np.pi * coordinate.resolution,
                     significance=sigma,
                     possible=_possible(line, ratio, coordinates),
                 )
