@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.correction.light import AMBER, GREEN, RED, Light, Reason, light_of
+from omsm_ros.core.correction.light import AMBER, GREEN, RED, Light, Reason, light_of, noisier
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import declared, with_latency
@@ -116,3 +116,56 @@ def test_other_doubts_make_it_amber(settled: Calibration) -> None:
     doubt = Reason("half of the points are lost", "run slower")
     assert light(settled, all_but(), doubts=[doubt]).reasons == (doubt,)
     assert str(doubt) == "half of the points are lost: run slower"
+
+
+def test_scatter_beyond_what_is_stated_is_told_with_both() -> None:
+    """3 and 4 nm stated are 5, with 12 beyond they are 13; what all heights share is no scatter."""
+    budget = {"probe_noise": 3e-9, "vibration": 4e-9, "scan_scatter": 12e-9, "dynamics": 1e-6}
+    (reason,) = noisier(budget)
+    assert reason.what == (
+        "heights of this scan scatter by 13.0 nm, 5.00 nm by what is stated of single readings"
+    )
+    assert "state probe_noise" in reason.remedy
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e-9, 2e-9])
+def test_a_little_more_scatter_is_light_and_texture(beyond: float) -> None:
+    assert not [*noisier({"probe_noise": 5e-9, "scan_scatter": beyond})]
+
+
+def test_the_unit_of_the_scatter_does_not_matter() -> None:
+    for size in (1e-12, 1e-9, 1e-3):
+        assert [*noisier({"probe_noise": size, "scan_scatter": size})]
+        assert not [*noisier({"probe_noise": size, "scan_scatter": 0.3 * size})]
+
+
+def test_where_nothing_is_stated_nothing_is_exceeded() -> None:
+    assert not [*noisier({"scan_scatter": 1e-6})]
+    assert not [*noisier({})]
+
+
+def test_what_all_heights_share_adds_in_squares(settled: Calibration) -> None:
+    heights = {"dynamics": 2e-9, "tilt": 6e-9, "drift": 9e-9}
+    found = light_of(settled, heights, all_but(), accuracy=30e-9)
+    assert found.uncertainty == pytest.approx(22e-9)
+    # Where none is asked for, the accuracy is what is stated.
+    assert light_of(settled, heights, all_but()).accuracy == found.uncertainty
+    nothing = light_of(settled, {}, all_but(), accuracy=1e-9)
+    assert (nothing.uncertainty, nothing.level) == (0.0, GREEN)
+
+
+def test_what_is_too_large_stands_before_what_nobody_looked_at(settled: Calibration) -> None:
+    doubt = Reason("half of the points are lost")
+    found = light_of(settled, HEIGHTS, all_but("vibration"), accuracy=9e-9, doubts=[doubt])
+    what = [reason.what for reason in found.reasons]
+    assert found.level == RED
+    assert "exceeds the accuracy" in what[0]
+    assert what[1:] == ["vibration not evaluated", "half of the points are lost"]
+    assert str(doubt) == doubt.what
+
+
+def test_the_entry_of_the_summary_has_every_reason(settled: Calibration) -> None:
+    entry = light(settled, all_but("vibration"), accuracy=20e-9).entry()
+    assert entry["level"] == AMBER
+    assert entry["accuracy"] == 20e-9
+    assert [reason["what"] for reason in entry["reasons"]] == ["vibration not evaluated"]
