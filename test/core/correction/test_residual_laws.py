@@ -104,14 +104,13 @@ def test_noise_and_what_could_hide_are_left_apart() -> None:
     assert not np.any(both[1])
 
 
-def test_the_largest_is_the_root_of_the_largest_sum() -> None:
+def test_the_largest_is_where_the_motion_is_fastest() -> None:
+    """All of the covariance counts, of noise and what could hide: rate times lag, through G²."""
     z = sine(5.0) * (1.5 + 0.5 * np.tanh((TIME - 3.0) / 0.3))
-    residual = Residual(calibration(), PERIOD)
-    known, hidden = residual.variances(z)
-    assert residual.largest(z) == pytest.approx(np.sqrt(np.max(known + hidden)))
-    assert residual.largest(z) == pytest.approx(
-        2 * AMPLITUDE * 2 * np.pi * 5.0 * LAG_U * abs(G.response(np.array([5.0]))[0]) ** 2, rel=0.02
-    )
+    noise = [float(v) for v in np.diag([0.0, LAG_U**2 / 4, 0.0]).ravel()]
+    expected = 2 * AMPLITUDE * 2 * np.pi * 5.0 * LAG_U * abs(G.response(np.array([5.0]))[0]) ** 2
+    for known in (calibration(), calibration(certificate={"noise_covariance": noise})):
+        assert Residual(known, PERIOD).largest(z) == pytest.approx(expected, rel=0.02)
 
 
 def test_the_same_path_in_a_tenth_of_the_time_is_ten_times_as_uncertain() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.core.verification.polar_surface import PolarBasis, spline_columns
@@ -82,3 +83,67 @@ def test_the_rim_is_in_the_last_interval() -> None:
     terms = matrix(radius, angle)
     cubic = np.linalg.lstsq(terms[:-2], height[:-2], rcond=None)[0]
     np.testing.assert_allclose(terms @ cubic, height, atol=1e-9)
+
+
+@pytest.mark.parametrize("intervals", [1, 4, 9])
+def test_splines_are_those_of_scipy(intervals: int) -> None:
+    place = np.linspace(0.0, intervals, 60, endpoint=False)
+    knots = np.arange(-3.0, intervals + 4.0)
+    expected = BSpline.design_matrix(place, knots, 3).toarray()
+    np.testing.assert_allclose(spline_columns(place, intervals), expected, atol=1e-14)
+
+
+def test_a_surface_is_smooth_to_the_second_derivative_at_every_knot() -> None:
+    """Differences across a knot go with the third power of the step, as within an interval."""
+    coefficients = np.random.default_rng(4).normal(size=BASIS.size)
+    step = 1e-3 * BASIS.width
+    for k in range(1, BASIS.intervals):
+        edge = BASIS.inner + k * BASIS.width
+        at = [k - 1, k - 1, k - 1, k, k, k]
+        near = edge + step * np.array([-2.5, -1.5, -0.5, 0.5, 1.5, 2.5])
+        heights = [
+            BASIS.rows(i, np.array([r]), np.array([0.7])).heights(coefficients[BASIS.terms(i)])[0]
+            for i, r in zip(at, near, strict=True)
+        ]
+        third = np.abs(np.diff(heights, 3))
+        assert np.max(third) < 1e-8 * np.ptp(coefficients)
+
+
+def test_terms_are_counted_spline_by_spline() -> None:
+    """Six intervals have nine cubic splines, three harmonics seven functions of the angle."""
+    assert (BASIS.waves, BASIS.size) == (7, 63)
+    assert BASIS.width == pytest.approx(2e-3)
+    assert [BASIS.terms(k) for k in (0, 5)] == [slice(0, 28), slice(35, 63)]
+    covered = [BASIS.inner + (k + 0.5) * BASIS.width for k in range(6)]
+    assert BASIS.interval(np.array(covered)).tolist() == list(range(6))
+    # Beyond either rim the nearest interval goes on.
+    assert BASIS.interval(np.array([0.0, 1.0])).tolist() == [0, 5]
+
+
+def turned(coefficients: FloatArray, angle: float) -> FloatArray:
+    """Coefficients of the surface turned by ``angle``: cosines and sines of each harmonic mix."""
+    shape = coefficients.reshape(-1, BASIS.waves)
+    order = angle * np.arange(1, BASIS.harmonics + 1)
+    mean, cosines, sines = np.split(shape, [1, BASIS.harmonics + 1], axis=1)
+    along = cosines * np.cos(order) - sines * np.sin(order)
+    across = cosines * np.sin(order) + sines * np.cos(order)
+    return np.concatenate([mean, along, across], axis=1).ravel()
+
+
+def test_a_turned_surface_is_the_same_elsewhere() -> None:
+    coefficients = np.random.default_rng(5).normal(size=BASIS.size)
+    radius, angle = points(200)
+    there = matrix(radius, angle + 0.9) @ turned(coefficients, 0.9)
+    np.testing.assert_allclose(there, matrix(radius, angle) @ coefficients, atol=1e-12)
+    assert BASIS.amplitudes(turned(coefficients, 0.9)) == pytest.approx(
+        BASIS.amplitudes(coefficients), rel=1e-12
+    )
+
+
+def test_without_harmonics_there_are_rings_alone() -> None:
+    rings = PolarBasis(inner=1e-3, outer=13e-3, intervals=6, harmonics=0)
+    rows = rings.rows(2, np.array([5.5e-3]), np.array([1.3]))
+    assert rows.matrix().shape == (1, 4)
+    assert rows.matrix().sum() == pytest.approx(1.0)
+    assert rows.derivatives(np.ones(4)) == (pytest.approx(0.0, abs=1e-9), pytest.approx(0.0))
+    assert len(rings.amplitudes(np.ones(9))) == 0
