@@ -13,6 +13,7 @@ from omsm_ros.core.dynamics.discretisation_error import (
     fast_length,
     velocity_spectrum,
 )
+from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.machine.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import DataError
@@ -98,3 +99,68 @@ def test_the_papers_path_costs_no_tenth_of_a_nanometre() -> None:
 def test_a_motion_that_cannot_be_judged_is_named(motion: np.ndarray, text: str) -> None:
     with pytest.raises(DataError, match=text):
         checked_motion(motion)
+
+
+@pytest.mark.parametrize("faded", [False, True])
+def test_a_steady_drift_is_its_own_velocity(faded: bool) -> None:
+    _, velocity = velocity_spectrum(3e-6 * TIME + 0.2, 1e-3, faded)
+    assert np.sqrt(np.sum(abs(velocity) ** 2) / 2) == pytest.approx(3e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("faded", [False, True])
+def test_where_it_is_and_how_long_a_sample_takes_only_scale_the_spectrum(faded: bool) -> None:
+    z = np.cumsum(np.random.default_rng(8).normal(size=3000)) * 1e-9
+    lines, plain = velocity_spectrum(z, 1e-3, faded)
+    np.testing.assert_allclose(velocity_spectrum(z + 0.5, 1e-3, faded)[1], plain, atol=1e-12)
+    np.testing.assert_allclose(velocity_spectrum(-2 * z, 1e-3, faded)[1], -2 * plain, rtol=1e-9)
+    slower, spectrum = velocity_spectrum(z, 1e-2, faded)
+    np.testing.assert_allclose(slower, lines / 10)
+    np.testing.assert_allclose(spectrum, plain / 10, rtol=1e-9)
+    # Backwards in time all lines are as strong.
+    turned = velocity_spectrum(z[::-1], 1e-3, faded)[1]
+    assert np.sum(abs(turned) ** 2) == pytest.approx(np.sum(abs(plain) ** 2), rel=0.02)
+
+
+def test_the_error_is_in_proportion_to_the_motion_and_knows_no_home() -> None:
+    digital = discretise(PAPER, 1e-3, 1)
+    z = 1e-3 * np.sin(2 * np.pi * 4.0 * TIME) + 1e-4 * np.sin(2 * np.pi * 9.0 * TIME)
+    plain = discretisation_error(PAPER, digital, z, up_to=50.0)
+    assert discretisation_error(PAPER, digital, -3 * z, up_to=50.0) == pytest.approx(
+        tuple(3 * size for size in plain), rel=1e-9, abs=0
+    )
+    moved = discretisation_error(PAPER, digital, z + 0.3, up_to=50.0)
+    assert moved == pytest.approx(plain, rel=1e-4, abs=0)
+
+
+def test_above_the_band_no_error_is_claimed() -> None:
+    digital = discretise(PAPER, 1e-3, 1)
+    low, high = (a * np.sin(2 * np.pi * f * TIME) for a, f in ((1e-3, 4.0), (1e-5, 40.0)))
+    alone = discretisation_error(PAPER, digital, low, up_to=20.0)
+    both = discretisation_error(PAPER, digital, low + high, up_to=20.0)
+    assert both[0] == pytest.approx(alone[0], rel=0.02, abs=0)
+    wide, fast = (discretisation_error(PAPER, digital, z, up_to=60.0) for z in (low + high, high))
+    assert wide[0] == pytest.approx(np.hypot(alone[0], fast[0]), rel=0.02, abs=0)
+    assert fast[0] > 0.5 * alone[0]
+
+
+def test_errors_of_two_lines_add_in_squares() -> None:
+    digital = discretise(PAPER, 1e-3, 2)
+    parts = [1e-3 * np.sin(2 * np.pi * f * TIME) for f in (6.0, 17.0)]
+    one, two, both = (
+        discretisation_error(PAPER, digital, z, up_to=50.0)[0] for z in (*parts, sum(parts))
+    )
+    assert both == pytest.approx(np.hypot(one, two), rel=1e-2, abs=0)
+
+
+def test_a_response_that_is_a_gain_costs_nothing() -> None:
+    gain = TransferFunction(np.array([0.9]), np.ones(1))
+    z = 1e-3 * np.sin(2 * np.pi * 4.0 * TIME)
+    rms, peak_to_valley = discretisation_error(gain, discretise(gain, 1e-3), z, up_to=50.0)
+    assert max(rms, peak_to_valley) < 1e-18
+
+
+def test_the_shortest_motion_that_is_judged() -> None:
+    assert len(checked_motion(np.zeros(64))) == 64
+    assert checked_motion(np.arange(64)).dtype == np.float64
+    with pytest.raises(DataError, match=r"shape \(63,\), expected 64 samples"):
+        checked_motion(np.zeros(63))
