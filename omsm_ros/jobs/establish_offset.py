@@ -50,6 +50,8 @@ def established_offset(
     both = min(len(z), len(d))
     z, d = z[:both], d[:both]
     known = np.flatnonzero(np.isfinite(z))
+    if not len(known):
+        raise DataError(f"{str(path)!r} has no position of Z beside its distance; record a motion")
     z = np.interp(np.arange(both), known, z[known])
     found = counter_offset(
         z,

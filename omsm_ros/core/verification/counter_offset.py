@@ -66,17 +66,19 @@ def counter_offset(
             f"{np.count_nonzero(ok)} samples with a distance do not determine an offset of up to "
             f"{most} samples; record {max(_LEAST_SAMPLES, 4 * most)} or more before a fixed target"
         )
-    residual = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, most)
-    best = int(np.argmin(residual))
+    # Beyond the flank of any minimum, so that there is an elsewhere.
+    reach = max(most, _FLANK + 1)
+    residual = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, reach)
+    best = reach - most + int(np.argmin(residual[reach - most : reach + most + 1]))
     elsewhere = np.delete(_between(residual), np.s_[max(0, best - _FLANK) : best + _FLANK + 1])
     contrast = float(elsewhere.min() / max(residual[best], np.finfo(float).tiny))
     if contrast < _CONTRAST:
         raise DataError(
             f"the motion fits at several offsets (least residual elsewhere {contrast:.3g} times "
-            f"that at {best - most} samples, {_CONTRAST} asked for); move Z unevenly by many times "
-            "the noise before a fixed target, or state counter_offset"
+            f"that at {best - reach} samples, {_CONTRAST} asked for); move Z unevenly by many "
+            "times the noise before a fixed target, or state counter_offset"
         )
-    return _refined(z, distance, ok, best - most, lag, lag_uncertainty)
+    return _refined(z, distance, ok, best - reach, lag, lag_uncertainty)
 
 
 def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArray:

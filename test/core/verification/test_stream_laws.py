@@ -78,6 +78,14 @@ def test_a_range_that_is_searched_wider_finds_the_same() -> None:
         like(offset(most=most))
 
 
+@pytest.mark.parametrize("true", [-2, -1, 0, 1, 2])
+def test_a_slow_recording_is_searched_over_few_samples(true: int) -> None:
+    """At 10 Hz a quarter of a second is two: what else would fit lies beyond them."""
+    distance = 50e-6 - 0.99 * PATH[AT + true]
+    for most in (2, 3):
+        assert offset(distance=distance, most=most).samples == true
+
+
 def test_a_lag_that_is_stated_moves_the_fraction_by_itself() -> None:
     found = offset(lag=0.1, lag_uncertainty=0.02)
     assert found.fraction == pytest.approx(PLAIN.fraction + 0.1, abs=1e-9)
