@@ -163,6 +163,7 @@ ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
 
 LENGTH = Quantity("length", "m", -10.0, 10.0, "give it in metres")
 RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if convex", signed=True)
+FEED = Quantity("feed of a turn", "m", 1e-9, 1.0, "give it in metres")
 FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
 CONIC_CONSTANT = Quantity("conic constant", "", -1e4, 1e4, "0 is a sphere, -1 a paraboloid")
 # Of a term of a surface: with the greatest power and length its square stays finite.

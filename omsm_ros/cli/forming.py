@@ -127,7 +127,9 @@ def _declare_surface(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("surface", type=Path, metavar="SURFACE.yaml")
     radius, speed = number(quantities.STEP), number(quantities.SPEED)
     sub.add_argument("--radius", type=radius, required=True, help="of the disc [m]")
-    sub.add_argument("--feed", type=radius, default=1e-4, help="of the spiral, a turn [m]")
+    sub.add_argument(
+        "--feed", type=number(quantities.FEED), default=1e-4, help="of the spiral, a turn [m]"
+    )
     sub.add_argument("--rpm", type=speed, default=30.0, help="of the spindle")
     sub.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="as of omsm predict")
     sub.add_argument(

@@ -51,7 +51,7 @@ def _declare_twin(sub: argparse.ArgumentParser) -> None:
         "--rpm", type=number(quantities.SPEED), default=usual.spindle_speed, help="of the spindle"
     )
     sub.add_argument(
-        "--feed", type=number(quantities.RADIUS), default=usual.feed_per_turn, help="[m] a turn"
+        "--feed", type=number(quantities.FEED), default=usual.feed_per_turn, help="[m] a turn"
     )
     sub.add_argument("--disturbances", type=Path, metavar="FILE", help="what is wrong with it")
     sub.add_argument("--seed", type=number(quantities.SEED), default=1, help="of noise and part")

@@ -54,6 +54,19 @@ def test_verify_on_a_chirp(capsys, tmp_path, calibration):
     assert abs(np.degrees(band["lag_after"])) < 0.02
 
 
+def test_verify_refuses_what_is_no_free_path(capsys, tmp_path, calibration, small_scan):
+    """Before a part the probe sees its surface, not the motion of Z."""
+    made = record(Cell(), Chirp(duration=5.0), Flat())
+    turned = replace(made, distance=replace(made.distance, distance=-made.distance.distance))
+    for name, recording, said in (
+        ("scan", small_scan, "looks at a fixed target"),
+        ("turned", turned, "turn its sign"),
+    ):
+        bag = write(tmp_path / f"{name}.mcap", recording)
+        assert cli.main(["verify", str(bag), "--calibration", str(calibration)]) == 2
+        assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("ahead", [0, 37])
 def test_verify_finds_the_offset_of_two_counters(capsys, tmp_path, calibration, ahead):
     """The probe's counter is ``ahead``: without the offset, nothing is paired rightly."""

@@ -186,3 +186,8 @@ def test_limits_in_another_unit_are_refused(capsys, tmp_path, calibration):
     said = refused(capsys, "predict", tmp_path / "m.csv", *words)
     assert "probe_range is 100.0 m" in said
     assert "give it in metres" in said
+
+
+@pytest.mark.parametrize(("feed", "said"), [("10", "feed of a turn is 10.0 m"), ("0.5", "not one")])
+def test_a_feed_that_makes_no_spiral_is_refused(capsys, tmp_path, feed, said):
+    assert said in refused(capsys, "twin", "--out", tmp_path, "--radius", "0.001", "--feed", feed)

@@ -122,6 +122,12 @@ class Spiral:
                 f"{self.feed_per_turn!r} m must be positive, spindle_speed "
                 f"{self.spindle_speed!r} rpm not zero"
             )
+        if self.feed_per_turn > self.start_radius:
+            raise ConfigurationError(
+                f"spiral: a feed of {self.feed_per_turn!r} m a turn from a radius of "
+                f"{self.start_radius!r} m makes not one turn; give a smaller feed, or a larger "
+                "radius"
+            )
 
     @property
     def duration(self) -> float:
