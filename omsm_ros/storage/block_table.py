@@ -102,5 +102,6 @@ def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
             stamp_ns=int(stamp[start]),
             first_sample=int(first[start]),
             sample_period=float(period[start]),
+            parts=tuple(zip(first[start:stop].tolist(), stamp[start:stop].tolist(), strict=True)),
             **{name: np.array(rows[name], channel).ravel() for name, channel in present},
         )

@@ -69,11 +69,13 @@ class Block:
     stamp_ns: time of the first sample [ns, ROS time]
     first_sample: trigger counter of the first sample
     sample_period: [s]
+    parts: first sample and stamp of each message that it was joined of; empty if of one
     """
 
     stamp_ns: int
     first_sample: int
     sample_period: float
+    parts: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:
         """Samples in the block."""

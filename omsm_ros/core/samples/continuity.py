@@ -9,6 +9,7 @@ times the sample period, when a recording is played in time lapse.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from omsm_ros.core.samples.blocks import Block
@@ -95,3 +96,59 @@ class TriggerCount:
         # An overlapping block is due between the newest block and the next one.
         due_ns = (first - self._newest_first) * block.sample_period * NANOSECONDS_PER_S
         return elapsed_ns > due_ns + tolerance_ns
+
+
+# Stamps that leap so far ahead are of a motion after a pause; half of what settles pairs live [ns].
+_PAUSE_NS = 0.5e9
+
+
+class StampLine:
+    """Stamps of one stream's blocks, in the order of sessions and counts."""
+
+    def __init__(self) -> None:
+        self._coming: deque[tuple[int, int, int]] = deque()
+        self._current: tuple[int, int, int] | None = None
+
+    def add(self, session: int, count: int, stamp_ns: int) -> None:
+        """Append the newest block's session, first count and stamp."""
+        self._coming.append((session, count, stamp_ns))
+
+    def extend(self, session: int, offset: int, stamps: Iterable[tuple[int, int]]) -> None:
+        """Append first counts, less ``offset``, and stamps of the newest blocks of a session."""
+        self._coming.extend((session, first + offset, stamp) for first, stamp in stamps)
+
+    def advance(self, session: int, count: int) -> bool:
+        """Go to the block of ``count``; return whether it begins there."""
+        while self._coming and self._coming[0][:2] <= (session, count):
+            self._current = self._coming.popleft()
+            if self._current[:2] == (session, count):
+                return True
+        return False
+
+    @property
+    def coming(self) -> tuple[int, int, int] | None:
+        """Session, first count and stamp of the next block; None before it is there."""
+        return self._coming[0] if self._coming else None
+
+    def go_on(self) -> None:
+        """Go to the next block."""
+        self._current = self._coming.popleft()
+
+    def leaps(self, session: int, count: int, period_ns: float) -> bool:
+        """Return whether the block that begins at ``count``, if one does, comes after a pause."""
+        expected = self.stamp_of(session, count, period_ns)
+        if expected is None or not self._coming or self._coming[0][:2] != (session, count):
+            return False
+        return self._coming[0][2] - expected >= _PAUSE_NS
+
+    def next_in(self, session: int, end: int) -> int:
+        """Return where the next block begins, ``end`` if not before it."""
+        if self._coming and self._coming[0][0] == session:
+            return min(self._coming[0][1], end)
+        return end
+
+    def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
+        """Return the time of the sample ``count`` [ns], None where no block says it."""
+        if self._current is None or self._current[0] != session:
+            return None
+        return self._current[2] + (count - self._current[1]) * period_ns

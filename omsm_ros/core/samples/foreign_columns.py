@@ -266,6 +266,7 @@ def axis_blocks(
             stamp_ns=stamp_ns,
             first_sample=first,
             sample_period=rows.period,
+            parts=(),
             **{c: values[part] for c, values in channels.items()},
         )
 

@@ -161,6 +161,7 @@ def _at(
         stamp_ns=block.stamp_ns,
         first_sample=block.first_sample,
         sample_period=block.sample_period,
+        parts=(),
         **channels,
     )
 

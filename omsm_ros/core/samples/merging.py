@@ -22,7 +22,7 @@ MOST_TOGETHER = 100
 
 # Stamps within one block are those of its first sample and the period; they are moved no further.
 _STAMP_TOLERANCE_S = 1e-3
-_NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period")
+_NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period", "parts")
 
 
 def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:

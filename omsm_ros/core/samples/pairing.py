@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.samples.accounts import Reason, Tally
 from omsm_ros.core.samples.blocks import Block, FloatArray
-from omsm_ros.core.samples.continuity import Arrival, TriggerCount
-from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch, StampLine
+from omsm_ros.core.samples.continuity import Arrival, StampLine, TriggerCount
+from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
@@ -108,12 +108,18 @@ class Intake:
         return arrival
 
     def _note(self, block: Block, arrival: Arrival) -> None:
-        """Keep the stamp of what is new of ``block``."""
-        first = block.first_sample + self._offset
-        skip = max(arrival.first + arrival.skip - first, 0)
-        if skip < len(block):
-            stamp_ns = block.stamp_ns + round(skip * _period_ns(block))
-            self.stamps.add(arrival.session, first + skip, stamp_ns)
+        """Keep the stamps of what is new of ``block``."""
+        period_ns, begins = _period_ns(block), arrival.first + arrival.skip
+        stamps = block.parts or ((block.first_sample, block.stamp_ns),)
+        if begins == stamps[0][0] + self._offset:  # as nearly always: all of it is new
+            self.stamps.extend(arrival.session, self._offset, stamps)
+            return
+        ends = [*(first for first, _ in stamps[1:]), block.end]
+        for (first_sample, stamp_ns), end in zip(stamps, ends, strict=True):
+            skip = max(begins - first_sample - self._offset, 0)
+            if skip < end - first_sample:
+                new = first_sample + self._offset + skip
+                self.stamps.add(arrival.session, new, stamp_ns + round(skip * period_ns))
 
     def end(self) -> None:
         """Begin a session with whatever comes next."""

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.continuity import StampLine
 from omsm_ros.core.samples.scatter import median, spread_about_median
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
@@ -75,8 +76,6 @@ class CommonTrigger:
 
 # One driver's stamps of one trigger, rounded twice, differ by no more than this [ns].
 _SAME_NS = 2.0
-# Stamps that leap so far ahead are of a motion after a pause; half of what settles pairs live [ns].
-_PAUSE_NS = 0.5e9
 # Pairs wait no longer than this for the first verdict: blocks are too long for one [s].
 _MOST_WAIT_S = 10.0
 
@@ -101,45 +100,6 @@ class Slip:
             f"the trigger counter slipped by {self.samples} samples against that of the axes: "
             f"{self.remedy}"
         )
-
-
-class StampLine:
-    """Stamps of one stream's blocks, in the order of sessions and counts."""
-
-    def __init__(self) -> None:
-        self._coming: deque[tuple[int, int, int]] = deque()
-        self._current: tuple[int, int, int] | None = None
-
-    def add(self, session: int, count: int, stamp_ns: int) -> None:
-        """Append the newest block's session, first count and stamp."""
-        self._coming.append((session, count, stamp_ns))
-
-    def advance(self, session: int, count: int) -> bool:
-        """Go to the block of ``count``; return whether it begins there."""
-        while self._coming and self._coming[0][:2] <= (session, count):
-            self._current = self._coming.popleft()
-            if self._current[:2] == (session, count):
-                return True
-        return False
-
-    def leaps(self, session: int, count: int, period_ns: float) -> bool:
-        """Return whether the block that begins at ``count``, if one does, comes after a pause."""
-        expected = self.stamp_of(session, count, period_ns)
-        if expected is None or not self._coming or self._coming[0][:2] != (session, count):
-            return False
-        return self._coming[0][2] - expected >= _PAUSE_NS
-
-    def next_in(self, session: int, end: int) -> int:
-        """Return where the next block begins, ``end`` if not before it."""
-        if self._coming and self._coming[0][0] == session:
-            return min(self._coming[0][1], end)
-        return end
-
-    def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
-        """Return the time of the sample ``count`` [ns], None where no block says it."""
-        if self._current is None or self._current[0] != session:
-            return None
-        return self._current[2] + (count - self._current[1]) * period_ns
 
 
 class SlipWatch:
@@ -197,6 +157,8 @@ class SlipWatch:
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
+            if self._in_step(end, period_ns):
+                continue
             pairs = zip(self._lines, sessions, strict=True)
             if self._common or any(line.leaps(s, count, period_ns) for line, s in pairs):
                 yield count, self.end()
@@ -211,6 +173,33 @@ class SlipWatch:
         stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
         if self._common or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
+
+    def _in_step(self, end: int, period_ns: float) -> bool:
+        """Take the next stamps that one driver gave both streams; return whether there were any.
+
+        Nothing can have slipped there. Of a bag they are all there at once, and cost little.
+        """
+        if not self._common or self._starting or self._odd or self._state.samples:
+            return False
+        (axes, distance), (a, d) = self._lines, self.sessions
+        taken = False
+        while (late := axes.coming) is not None and (early := distance.coming) is not None:
+            count, skew = late[1], late[2] - early[2]
+            in_step = early[1] == count < end and late[0] == a and early[0] == d
+            if not in_step or abs(skew) > _SAME_NS:
+                break
+            axes.go_on()
+            distance.go_on()
+            stride = int(count // max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0))
+            if stride != self._judged:
+                self._judged = stride
+                self._since = count - _SPAN_S * NANOSECONDS_PER_S / period_ns
+                self._wander.append(skew)
+            self._stamps = [stamps + 1 for stamps in self._stamps]
+            self._shown = [count, count]
+            self._seen.append((count, skew, True, True, late[2]))
+            taken = True
+        return taken
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as it can be told."""

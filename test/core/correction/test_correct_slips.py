@@ -11,7 +11,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.samples.accounts import Account
 from omsm_ros.core.samples.blocks import Block
-from omsm_ros.core.samples.merging import consecutive
+from omsm_ros.core.samples.merging import consecutive, joined, uninterrupted
 from omsm_ros.core.samples.motion_record import assemble
 from omsm_ros.core.samples.slips import CommonTrigger
 from omsm_ros.errors import DataError
@@ -83,6 +83,40 @@ def test_live_and_offline_agree_to_the_last_bit(
     assert account == expected
     # Of blocks that waited together, a point is stamped by the first one.
     assert same_points(replace(live, stamp_ns=0), replace(offline, stamp_ns=0))
+
+
+def as_a_bag_gives_them(blocks: list[Block]) -> list[Block]:
+    """Blocks that follow on as one, which keeps the stamps of all; as of messages read at once."""
+    made: list[Block] = []
+    for run in uninterrupted(blocks):
+        parts = tuple((block.first_sample, block.stamp_ns) for block in run)
+        made.append(replace(joined(run), parts=parts))  # type: ignore[type-var]
+    return made
+
+
+@pytest.mark.parametrize("drivers", ["two", "one", "one, then two"])
+def test_blocks_that_a_bag_joins_are_judged_by_the_stamps_of_all(
+    scan: Recording, streams: tuple[list[Block], list[Block]], drivers: str
+) -> None:
+    axes, distance = streams
+    if drivers != "two":
+        axes, distance = (
+            cut(part(channel, 0, 5000), range(0, 5000, 50))
+            for channel in (scan.axes, scan.distance)
+        )
+    if drivers == "one, then two":  # and the counters are no longer those of one trigger
+        distance = [
+            replace(block, stamp_ns=block.stamp_ns + (6_000_000 if i >= 60 else 0))
+            for i, block in enumerate(distance)
+        ]
+    each, expected, _ = corrected(axes, distance, 0, CorrectionOptions())
+    together = as_a_bag_gives_them(axes), as_a_bag_gives_them(distance)
+    assert len(together[0]) < 3
+    found, account, corrector = corrected(*together, 0, CorrectionOptions())
+    assert account == expected
+    assert same_points(replace(found, stamp_ns=0), replace(each, stamp_ns=0))
+    assert ("slipped" in account.distance.counted) is (drivers != "one")
+    assert corrector.slips.one_driver is (drivers == "one")
 
 
 def test_diagnostics_say_what_slipped_and_what_to_do(
