@@ -164,17 +164,22 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
 
 
 @pytest.mark.parametrize("samples", [1, 10, 100, 400])
-def test_a_probe_whose_counter_is_off_takes_the_green_away(
+def test_a_probe_whose_counter_is_off_gives_no_points_and_is_told(
     tmp_path, small_scan_blocks, true_calibration, samples
 ):
-    """The pairs are of different instants, and every count is accounted for all the same."""
+    """The pairs are of different instants: whatever came of them would be no height."""
     path = tmp_path / "off.mcap"
     with BagWriter(path, TOPICS) as bag:
         for axes, distance in small_scan_blocks[:20]:
             bag.write_axes(axes)
             bag.write_distance(replace(distance, first_sample=distance.first_sample + samples))
-    said = light_reasons(path, true_calibration, tmp_path)
+    summary = measure(path, true_calibration, tmp_path / "out", report=False)
+    account = summary["samples"]["distance"]
+    assert account["corrected"] == 0
+    assert account["counted"]["slipped"] >= 2000 - samples - 21  # but for what settles
+    said = summary["warnings"]
     assert any(f"{samples} samples: their counters were not started together" in s for s in said)
+    assert any(f"slipped by {samples} samples" in s for s in said)
     assert any(f"{samples} samples: their counters" in s for s in inspect_bag(path).faults)
 
 
