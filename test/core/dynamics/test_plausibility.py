@@ -13,6 +13,7 @@ from omsm_ros.core.dynamics.latency import latency_of, unresolved
 from omsm_ros.core.dynamics.plausibility import MAX_TIME_CONSTANT_SAMPLES
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
+from omsm_ros.readable import plain
 
 GOOD = Calibration(
     dynamics=TransferFunction([1.0, 1e-4], [1.0, 1e-3, 1e-6], 2e-4),
@@ -151,3 +152,43 @@ def test_a_latency_that_no_probe_has_is_refused(entry: object, named: str) -> No
 def test_a_latency_comes_back_as_it_was() -> None:
     found = latency_of(changed(certificate={"latency": GOOD_LATENCY}))
     assert found.entry() == GOOD_LATENCY
+
+
+@pytest.mark.parametrize(("place", "power"), [(1, 1), (2, 1), (3, 2), (4, 1)])
+@pytest.mark.parametrize("trusted", [20.0, 100.0])
+def test_how_far_a_coefficient_leaves_the_response_open_is_told(
+    place: int, power: int, trusted: float
+) -> None:
+    """A coefficient of s^k that is uncertain by u leaves u ω^k at the end of the trusted band."""
+    deviation = 1e12
+    covariance = np.zeros((5, 5))
+    covariance[place, place] = deviation**2
+    factor = deviation * (2 * np.pi * trusted) ** power
+    with pytest.raises(CalibrationError, match="uncertain by a factor of") as refused:
+        changed(covariance=covariance, valid_up_to=trusted)
+    assert f"a factor of {plain(factor, 2)};" in str(refused.value)
+
+
+def test_correlations_are_judged_in_any_units() -> None:
+    """Perfectly correlated is possible, a little more is not, however the sizes differ."""
+    sizes = np.array([0.0, 1e-7, 1e-7, 1e-10, 1e-7])
+    for share, possible in ((1.0, True), (-1.0, True), (1.01, False)):
+        covariance = np.diag(sizes**2)
+        covariance[1, 3] = covariance[3, 1] = share * sizes[1] * sizes[3]
+        if possible:
+            assert np.array_equal(changed(covariance=covariance).covariance, covariance)
+        else:
+            with pytest.raises(CalibrationError, match="negative eigenvalue"):
+                changed(covariance=covariance)
+
+
+@pytest.mark.parametrize("samples", [9_999, 10_000])
+def test_the_longest_delay_is_one_of_samples(samples: int) -> None:
+    for period in (1e-5, 1e-4):
+        late = TransferFunction(
+            GOOD.dynamics.numerator, GOOD.dynamics.denominator, samples * period
+        )
+        assert changed(dynamics=late, sample_period=period).dynamics.delay == samples * period
+        later = TransferFunction(late.numerator, late.denominator, 1.01 * 10_000 * period)
+        with pytest.raises(CalibrationError, match=r"1\.01 · 10⁴ samples of .* at most 10000"):
+            changed(dynamics=later, sample_period=period)
