@@ -169,22 +169,9 @@ def test_how_far_a_coefficient_leaves_the_response_open_is_told(
     assert f"a factor of {plain(factor, 2)};" in str(refused.value)
 
 
-def test_correlations_are_judged_in_any_units() -> None:
-    """Perfectly correlated is possible, a little more is not, however the sizes differ."""
-    sizes = np.array([0.0, 1e-7, 1e-7, 1e-10, 1e-7])
-    for share, possible in ((1.0, True), (-1.0, True), (1.01, False)):
-        covariance = np.diag(sizes**2)
-        covariance[1, 3] = covariance[3, 1] = share * sizes[1] * sizes[3]
-        if possible:
-            assert np.array_equal(changed(covariance=covariance).covariance, covariance)
-        else:
-            with pytest.raises(CalibrationError, match="negative eigenvalue"):
-                changed(covariance=covariance)
-
-
 @pytest.mark.parametrize("samples", [9_999, 10_000])
 def test_the_longest_delay_is_one_of_samples(samples: int) -> None:
-    for period in (1e-5, 1e-4):
+    for period in (1e-5, 5e-5):
         late = TransferFunction(
             GOOD.dynamics.numerator, GOOD.dynamics.denominator, samples * period
         )
