@@ -28,10 +28,11 @@ def through_gap(motion: FloatArray, half: float) -> FloatArray:
     # Along a run of one direction only its end counts.
     turns = moved[np.flatnonzero(np.diff(np.sign(change[moved])))]
     ends = np.append(turns, len(motion) - 1)
-    held, state, first = np.empty_like(motion), motion[0], 0
-    for end in ends:
-        held[first : end + 1] = state
-        state, first = min(max(state, motion[end] - half), motion[end] + half), end + 1
+    state, states = float(motion[0]), []
+    for end in motion[ends].tolist():
+        states.append(state)
+        state = min(max(state, end - half), end + half)
+    held = np.repeat(states, np.diff(ends, prepend=-1))
     return np.asarray(np.clip(held, motion - half, motion + half))
 
 
@@ -52,10 +53,12 @@ def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
     """
     change = np.diff(motion, prepend=motion[0])
     kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
-    force, value = np.zeros(len(motion)), 0.0
-    for index in np.flatnonzero(change):
-        value = direction[index] + (value - direction[index]) * kept[index]
-        force[index] = value
     moved = change != 0
+    value, values = 0.0, []
+    for way, part in zip(direction[moved].tolist(), kept[moved].tolist(), strict=True):
+        value = way + (value - way) * part
+        values.append(value)
+    force = np.zeros(len(motion))
+    force[moved] = values
     last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
     return force[last], np.cumprod(kept)

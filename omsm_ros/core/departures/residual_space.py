@@ -67,7 +67,15 @@ class ResidualSpace:
 
     def _compared(self, columns: FloatArray) -> FloatArray:
         """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
-        return np.compress(self.problem.used, columns.T, axis=1).T
+        first, last = self._places[0], self._places[-1]
+        if last - first < len(self._places):
+            # Without a gap there is nothing to pick.
+            return np.ascontiguousarray(columns.T[:, first : last + 1]).T
+        return np.take(columns.T, self._places, axis=1).T
+
+    @cached_property
+    def _places(self) -> IntArray:
+        return np.flatnonzero(self.problem.used)
 
     def freed(self, columns: FloatArray) -> FloatArray:
         """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""

@@ -18,6 +18,7 @@ from omsm_ros.core.fitting.steps import (
     Steps,
     check_usable,
     find_steps,
+    lasting,
     sample_noise,
 )
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -144,9 +145,9 @@ def _after_loss(record: MotionRecord) -> BoolArray:
     samples = len(record)
     if record.z_lost is None:
         return np.zeros(samples, np.bool_)
-    memory = np.ones(round(_SETTLING_S / record.sample_period) + _EDGE_GUARD + 1)
-    touched = np.convolve(record.z_lost, memory)[_EDGE_GUARD:][:samples]
-    return np.asarray(touched > 0.5)
+    ahead = np.concatenate([record.z_lost, np.zeros(_EDGE_GUARD, np.bool_)])
+    memory = round(_SETTLING_S / record.sample_period) + _EDGE_GUARD
+    return lasting(ahead, memory)[_EDGE_GUARD:]
 
 
 def _recorded_whole(steps: Steps, record: MotionRecord) -> Steps:

@@ -34,7 +34,7 @@ _ADDED_POLE = -10.0
 # Samples of a period; of two such a fit is started on one. A step test at 1 kHz has 20 000.
 _ENOUGH_SAMPLES = 20_000
 # Half the sampling rate of a coarse problem over the rate at which the motion has its content.
-_ABOVE_CONTENT = 2.0
+_ABOVE_CONTENT = 1.25
 
 
 @dataclass(frozen=True, eq=False)

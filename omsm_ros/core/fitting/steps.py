@@ -97,8 +97,14 @@ def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
     width = min(max(round(_REST_S / sample_period), 2), len(z) - 1)
     changes = np.abs(z[width:] - z[:-width]) > threshold
     # A change between k and k + width lies anywhere between: close the window over it.
-    covered = np.convolve(changes, np.ones(width + 1))
-    return np.asarray(covered > 0.5)
+    return lasting(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
+
+
+def lasting(flags: BoolArray, samples: int) -> BoolArray:
+    """Return True where ``flags`` (n,) is, and for ``samples`` after it, (n,)."""
+    count = np.concatenate([[0], np.cumsum(flags)])
+    before = np.maximum(np.arange(len(flags)) - samples, 0)
+    return np.asarray(count[1:] > count[before])
 
 
 def _edges(z: FloatArray, moving: BoolArray) -> tuple[Edge, ...]:

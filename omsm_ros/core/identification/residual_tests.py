@@ -16,7 +16,7 @@ from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
 from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.reading_steps import reading_step
-from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.fitting.steps import Steps, lasting
 from omsm_ros.core.fitting.timing_noise import motion_scatter
 from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -110,8 +110,7 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
 
 
 def _active(steps: Steps, period: float) -> BoolArray:
-    after = round(_AFTER_EDGE_S / period)
-    return np.asarray(np.convolve(steps.moving, np.ones(after + 1))[: len(steps.moving)] > 0.5)
+    return lasting(steps.moving, round(_AFTER_EDGE_S / period))
 
 
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
