@@ -6,19 +6,23 @@ import pytest
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Problem, fit
-from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.fitting.starting_points import StartingPoints, coarser
 
 PERIOD = 1e-3
 
 
-def points_for(dynamics):
-    time = np.arange(4000) * PERIOD
+def points_for(dynamics, finer=1, lost=()):
+    """Four seconds; ``finer``: times as many samples."""
+    time = np.arange(4000 * finer) * (PERIOD / finer)
     motion = sum(1e-5 * np.exp(-(((time - c) / 4e-3) ** 2)) for c in np.arange(0.4, 3.6, 0.37))
-    frequency = np.fft.rfftfreq(len(motion), PERIOD)
+    frequency = np.fft.rfftfreq(len(motion), PERIOD / finer)
     seen = np.fft.irfft(np.fft.rfft(motion) * dynamics.response(frequency), len(motion))
     seen = seen + np.random.default_rng(1).normal(0, 1e-9, len(motion))
     used = np.ones(len(motion), bool)
-    problem = Problem(motion, seen, used, PERIOD, np.ones((len(motion), 1)), 300.0)
+    used[list(lost)] = False
+    seen[~used] = 0.0
+    background = np.ones((len(motion), 1))
+    problem = Problem(motion, seen, used, PERIOD / finer, background, 300.0)
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     return StartingPoints(problem, lag)
 
@@ -58,3 +62,33 @@ def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
         for shape in points.of(structure, []):
             assert len(shape) == scaled.nonlinear_size
             assert scaled.transfer_function(shape, np.ones(1)).is_stable
+
+
+@pytest.mark.parametrize("lost", [(), range(5, 48_000, 7), range(9000, 9400)], ids=str)
+@pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.1), (140.0, 0.02)])
+def test_many_samples_start_where_fewer_of_them_lead(frequency, damping, lost):
+    points = points_for(resonance(frequency, damping), finer=12, lost=lost)
+    structure = Structure(2, 0, False)
+    (start,) = points.of(structure, [])
+    assert frequencies_of(points, structure, [start]) == pytest.approx([frequency], rel=1e-3)
+    before = points.problem.effort.comparisons
+    found = fit(points.problem, structure, [start])
+    assert points.problem.effort.comparisons - before < 12
+    lines = np.array([5.0, 20.0, 60.0])
+    truth = resonance(frequency, damping).response(lines)
+    np.testing.assert_allclose(found.dynamics.response(lines), truth, rtol=1e-4)
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_a_coarser_problem_has_the_same_response(every):
+    """Of a plant and a motion whose spectra are known, to what noise leaves."""
+    truth = TransferFunction.from_ascending([1.0, 2e-3], [1.0, 6e-3, 2e-5], 1e-3)
+    problem = points_for(truth, finer=4).problem
+    coarse = coarser(problem, every)
+    assert coarse.period == pytest.approx(every * problem.period)
+    assert len(coarse.input) == len(coarse.output) == len(coarse.used) == len(coarse.background)
+    structure = Structure(2, 1, True)
+    start = Scaled(structure, problem.rate).nonlinear_of(np.array([-1.0, -2.0], complex), 0.3)
+    found = fit(coarse, structure, [start]).dynamics
+    lines = np.geomspace(1.0, 60.0, 8)
+    np.testing.assert_allclose(found.response(lines), truth.response(lines), rtol=1e-3)

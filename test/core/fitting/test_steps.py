@@ -9,6 +9,7 @@ from omsm_ros.core.fitting.steps import (
     backlash_columns,
     find_steps,
     held_out,
+    lasting,
     sample_noise,
     segments,
 )
@@ -157,3 +158,10 @@ def test_backlash_of_an_edge_begins_with_it():
     assert np.all(direction[: first.start] == 0)
     assert np.all(direction[first.start : second.start] == 1)
     assert np.all(direction[second.start :] == -1)
+
+
+@settings(max_examples=30)
+@given(flags=st.lists(st.booleans(), max_size=40), samples=st.integers(0, 50))
+def test_what_lasts_is_what_was_within_so_many_samples(flags, samples):
+    expected = [any(flags[max(k - samples, 0) : k + 1]) for k in range(len(flags))]
+    assert lasting(np.array(flags, bool), samples).tolist() == expected
