@@ -151,6 +151,15 @@ def test_stated_noise_of_the_offsets_is_their_scatter():
     assert scatter == pytest.approx(np.sqrt(np.nanmean(runs[0].uncertainty ** 2)), rel=0.1)
 
 
+def test_four_cells_of_the_points_are_the_finest_wave_that_is_compensated():
+    """Eight points a cell: cells of √8 distances of the points, which fill their square."""
+    area = map_of(0 * X)
+    pitch = np.sqrt(8 * np.ptp(X) * np.ptp(Y) / len(X))
+    compensation(area, Flat(), 4.01 * pitch)
+    with pytest.raises(DataError, match="finer than the points resolve"):
+        compensation(area, Flat(), 3.99 * pitch)
+
+
 def test_a_low_pass_finer_than_the_points_and_a_single_row_are_refused():
     with pytest.raises(DataError, match=r"low-pass of 0.0001 m is finer .* measure more points"):
         compensation(map_of(0 * X), Flat(), 1e-4)
