@@ -42,7 +42,7 @@ def response_with_band(calibration: Calibration, seen: FrequencyResponse | None 
     made = bode(calibration, None, calibration.sample_period)
     made.set_size_inches(7.4, 5.45)
     gain, phase, _ = made.get_axes()
-    style.label(gain, y=gain.get_ylabel(), title="Response")
+    style.label(gain, title="Response")
     if seen is not None:
         _draw_points(gain, phase, thinned(seen))
     style.legend_above(gain)

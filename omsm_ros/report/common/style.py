@@ -100,9 +100,11 @@ def logarithmic(axis: XAxis | YAxis, *, every: Sequence[float] = (1.0,)) -> None
 
 
 def label(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
-    """Label the axes, with their units, and put a title on the left."""
-    axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
-    axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
+    """Label the axes, with their units, and put a title on the left; what is empty stays."""
+    if x:
+        axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
+    if y:
+        axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
     if title:
         # With a stated place nothing is measured to find one.
         look = {"fontsize": TITLE_PT, "color": INK, "fontweight": "bold"}

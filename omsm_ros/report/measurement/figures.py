@@ -173,7 +173,7 @@ def dynamic_error(
     if left:
         style.legend_above(lower)
         style.label(lower, y="after [nm]")
-    style.label(lower, x="time [s]", y=lower.get_ylabel())
+    style.label(lower, x="time [s]")
     return made
 
 

@@ -69,7 +69,7 @@ def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
         _draw(ax, curve, MILLIMETRE_M, NANOMETRE_M)
         style.label(ax, y="[nm]", title=f"Registered deviation {_LINES[name]}")
-    axes[-1, 0].set_xlabel("place on the line [mm]", fontsize=style.TEXT_PT, color=style.INK)
+    style.label(axes[-1, 0], x="place on the line [mm]")
     return made
 
 

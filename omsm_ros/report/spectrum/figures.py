@@ -47,7 +47,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
         _marks(row, named, TIME, 1.0, signal.duration)
         style.label(row, y="nm/√Hz", title=f"{style.named(signal.name)}, over time")
     _kinds(axes[0, 0], [row for _, named in scans for row in named])
-    style.label(axes[-1, 0], x="frequency [Hz]", y="nm/√Hz", title=axes[-1, 0].get_title("left"))
+    style.label(axes[-1, 0], x="frequency [Hz]")
     return made
 
 
@@ -65,13 +65,7 @@ def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | 
         _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
         row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
         style.label(row, y="nm·√mm", title=f"{style.named(signal.name)}, along the path")
-    title = axes[-1, 0].get_title("left")
-    style.label(
-        axes[-1, 0],
-        x="wavelength [µm]; dotted: twice the sampling distance",
-        y="nm·√mm",
-        title=title,
-    )
+    style.label(axes[-1, 0], x="wavelength [µm]; dotted: twice the sampling distance")
     return made
 
 
