@@ -86,7 +86,7 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     beside = file.with_name(SYSTEMATIC)
     fields = load_fields(beside) if beside.is_file() else None
     if fields is None:
-        return Measurement(lambda: _portions(cloud, None), notes, False)
+        return Measurement(lambda: _portions(cloud, None), (), False, notes)
     return Measurement(
         lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
     )
