@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.machine.kinematics import Geometry
 from omsm_ros.core.machine.limits import MachineLimits
-from omsm_ros.core.samples.foreign_columns import UNITS
 from omsm_ros.errors import FileError
+from omsm_ros.foreign_units import UNITS
 from omsm_ros.storage.column_map_file import load_column_map
 from omsm_ros.storage.machine_files import load_geometry, load_limits, load_pitch, save_geometry
 from omsm_ros.storage.motion_file import load_motion
