@@ -146,6 +146,7 @@ def summarise(
         **_places(calibration),
         "samples": done.account,
         "uncertainty_budget": done.budget,
+        "sample_period": done.sample_period,
         "stamp_skew": done.stamp_skew,
         "conditions": conditions(done, calibration),
         "settings": dict(calibration.settings),

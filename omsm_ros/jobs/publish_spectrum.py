@@ -30,7 +30,7 @@ def publish_spectra(
 ) -> dict[str, Any]:
     """Study the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
     clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))]
-    with result_folder(out, (*clouds, REPORT, SPECTRUM)) as folder:
+    with result_folder(out, (*clouds, *_clouds_before(out), REPORT, SPECTRUM)) as folder:
         scans = spectra_of(paths, options, progress)
         summary = summary_of(scans, options)
         files = {"spectrum": SPECTRUM}
@@ -48,6 +48,12 @@ def publish_spectra(
         summary["files"] = files
         save_json(folder / SPECTRUM, summary)
     return summary
+
+
+def _clouds_before(out: Path) -> list[str]:
+    """Return the clouds of an earlier run, which may have had more scans."""
+    earlier = out.glob("band_stopped_*.ply") if (out / SPECTRUM).is_file() else ()
+    return [path.name for path in earlier]
 
 
 def _write_cloud(path: Path, scan: SpectrumOfScan) -> None:

@@ -34,8 +34,10 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
             f"{str(result)!r} was corrected with a nominal surface, from which its figures "
             "deviate; give it (--nominal)"
         )
-    view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), calibration.sample_period)
-    figures = figures_of(view, calibration, nominal, calibration.sample_period)
+    # Another than the calibration's where that was overridden; older summaries do not say it.
+    period = summary.get("sample_period", calibration.sample_period)
+    view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), period)
+    figures = figures_of(view, calibration, nominal, period)
     title = f"Surface of {Path(str(summary.get('bag', result))).name}"
     publish(result, title, summary, calibration, figures, map_of(view, nominal, result))
     return result / REPORT

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.errors import FileError
-from omsm_ros.quantities import COUNTER, SIGNAL, STAMP
+from omsm_ros.quantities import COUNTER, SAMPLE_PERIOD, SIGNAL, STAMP
 from omsm_ros.storage.result_folder import read_result
 from omsm_ros.storage.schemas import check_form, ranged
 
@@ -61,6 +61,7 @@ _FORM = _group(
     {},
     bag=_TEXT,
     calibration=_TEXT,
+    sample_period=ranged(SAMPLE_PERIOD),
     samples={"type": "object", "additionalProperties": _STREAM},
     warnings=_TEXTS,
     settings=_ANY,

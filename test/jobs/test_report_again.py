@@ -9,8 +9,10 @@ from itertools import islice
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import CalibrationError, ConfigurationError, FileError
+from omsm_ros.jobs.corrected_scan import Admission
 from omsm_ros.jobs.measure import measure
 from omsm_ros.jobs.record_twin import write_nominal
 from omsm_ros.jobs.report_again import report_again
@@ -43,6 +45,26 @@ def test_it_is_the_page_of_the_correction(shop, capsys):
     assert cli.main(["report", str(shop / "result"), *arguments]) == 0
     assert str(page) in capsys.readouterr().out
     assert without_date(page.read_text()) == without_date(first)
+
+
+def test_a_rate_that_was_overridden_is_drawn_over_its_own_time(
+    tmp_path, small_scan_blocks, true_calibration
+):
+    with BagWriter(tmp_path / "scan.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for axes, distance in islice(iter(small_scan_blocks), 10):
+            slower = {"sample_period": 2e-3, "stamp_ns": 2 * axes.stamp_ns}
+            bag.write_axes(replace(axes, **slower))
+            bag.write_distance(replace(distance, **slower))
+    measure(
+        tmp_path / "scan.mcap", true_calibration, tmp_path / "out",
+        options=CorrectionOptions(accept_other_rate=True), admission=Admission(override=True),
+    )  # fmt: skip
+    page = tmp_path / "out" / "report.html"
+    first = page.read_text()
+    report_again(tmp_path / "out", true_calibration)
+    assert without_date(page.read_text()) == without_date(first)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["sample_period"] == 2e-3
 
 
 def test_another_calibration_is_refused(shop, true_calibration):
