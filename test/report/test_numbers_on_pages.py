@@ -21,7 +21,7 @@ from omsm_ros.report.spectrum.page import render as render_spectrum
 LENGTH = st.floats(1e-12, 1.0)
 KNOWN = st.one_of(st.none(), LENGTH)
 COUNT = st.integers(0, 10**9)
-FEW = settings(max_examples=8)
+FEW = settings(max_examples=5)
 
 
 def page_of(summary, **parts):

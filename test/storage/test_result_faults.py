@@ -204,7 +204,9 @@ def test_a_text_is_read_up_to_its_bound(tmp_path, size):
     [
         (OSError(errno.ENOSPC, "No space left on device", "/a/secret"), "No space left on device"),
         (ValueError("two\n  lines\tand more"), "two lines and more"),
-        (KeyError(), "KeyError"),
+        (KeyError("a.b"), "what it holds does not fit together"),
+        (MemoryError(), "it asks for more memory than there is"),
+        (ValueError(), "ValueError"),
         (ValueError("x" * 999), "x" * 200),
     ],
 )

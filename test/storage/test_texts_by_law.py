@@ -39,7 +39,7 @@ def typed(value):
     return (type(value), value, math.copysign(1, value) if isinstance(value, float) else 0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(JSON, st.sampled_from([None, 1]))
 def test_json_comes_back_with_every_bit_and_type(value, indent):
     text = strict_json.text_of(value, indent)
@@ -47,7 +47,7 @@ def test_json_comes_back_with_every_bit_and_type(value, indent):
     assert typed(strict_json.value_of(text, FileError, "note")) == typed(value)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(JSON)
 def test_what_is_unknown_becomes_null_and_nothing_else_changes(value):
     assert typed(strict_json.unknown_as_null(value)) == typed(value)
@@ -55,7 +55,7 @@ def test_what_is_unknown_becomes_null_and_nothing_else_changes(value):
     assert strict_json.unknown_as_null(nested) == {"a": [value, None], "b": {"c": None}}
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.text(alphabet='{}[]",:0123456789.eE+-truefalsn \\u\n', max_size=30))
 def test_a_text_is_read_as_python_reads_it_or_refused(text):
     """Never another value: strictness takes away, and adds nothing."""
@@ -81,7 +81,7 @@ PLAIN = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.dictionaries(st.text("xyz_ ", min_size=1, max_size=5), PLAIN, max_size=4))
 def test_json_is_yaml(content):
     """YAML 1.2 holds all of JSON: the same names, values and types, to eight levels."""
@@ -89,7 +89,7 @@ def test_json_is_yaml(content):
     assert typed(found) == typed(content)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     st.lists(st.lists(st.floats(-1e100, 1e100), min_size=3, max_size=3), min_size=2, max_size=6),
     st.permutations(["a", "b [mm]", "c c"]),
@@ -161,7 +161,7 @@ def zone_text(minutes, form):
     return form.format(sign=sign, h=size // 60, m=size % 60)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     st.datetimes(datetime(1970, 1, 2), datetime(2100, 1, 1)), ZONES,
     st.sampled_from(["{sign}{h:02}:{m:02}", "{sign}{h:02}{m:02}"]),
