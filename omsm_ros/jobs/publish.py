@@ -21,8 +21,8 @@ from omsm_ros.report.measurement.form_figures import form_figures
 from omsm_ros.report.measurement.gallery import levelled, surface_figures
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.storage.files import CURVES, DEVIATION, FORM, REPORT, save_text
+from omsm_ros.storage.form_file import read_curves, read_form
 from omsm_ros.storage.maps.read_map import read_points
-from omsm_ros.storage.result_folder import read_result
 
 
 def figures_of(
@@ -88,7 +88,8 @@ def publish(
 
     surface: map that a reader can enlarge
     """
-    form, curves = _json_in(out, FORM), _json_in(out, CURVES)
+    form = read_form(out / FORM) if (out / FORM).is_file() else {}
+    curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
     if form:
         figures = {**figures, **form_figures(form, curves)}
     date = moment(datetime.now(timezone.utc))
@@ -104,10 +105,3 @@ def publish_form(out: Path, title: str, summary: Mapping[str, Any] | None = None
     part = read_points(out / DEVIATION)
     layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
     publish(out, title, summary or {}, None, {}, embedded([layer]))
-
-
-def _json_in(out: Path, name: str) -> dict[str, Any]:
-    """Return the content of a file in ``out``; empty where the part was not registered."""
-    if not (out / name).is_file():
-        return {}
-    return read_result(out / name, name.removesuffix(".json"))

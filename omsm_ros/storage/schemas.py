@@ -10,12 +10,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from omsm_ros.errors import OmsmError
-from omsm_ros.quantities import Quantity, shown
+from omsm_ros.quantities import SIGNAL, Quantity, shown
 
 if TYPE_CHECKING:
     import jsonschema
 
 NUMBER: Mapping[str, Any] = {"type": "number"}
+TEXT: Mapping[str, Any] = {"type": "string"}
+TEXTS: Mapping[str, Any] = {"type": "array", "items": TEXT}
 
 
 def form(properties: Mapping[str, Any], required: Sequence[str]) -> dict[str, Any]:
@@ -32,6 +34,31 @@ def ranged(quantity: Quantity) -> dict[str, Any]:
     """Return the schema of a number within the range of ``quantity``, in its unit."""
     kind = "integer" if quantity.whole else "number"
     return {"type": kind, "minimum": quantity.low, "maximum": quantity.high}
+
+
+def group(needed: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+    """Return the schema of an object; it may hold more, which nobody reads."""
+    return {"type": "object", "properties": {**needed, **others}, "required": list(needed)}
+
+
+def rows(needed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of a list of such objects."""
+    return {"type": "array", "items": group(needed)}
+
+
+def or_none(schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of what may also be null."""
+    return {**schema, "type": [schema["type"], "null"]}
+
+
+# What nobody could know is written as null.
+KNOWN_OR_NOT = or_none(ranged(SIGNAL))
+FIGURE = group({"value": KNOWN_OR_NOT, "uncertainty": KNOWN_OR_NOT})
+"""A figure with its standard uncertainty."""
+CONFORMITY: Mapping[str, Any] = {
+    "verdict": {"enum": ["holds", "fails", "cannot tell"]},
+    "tolerance": ranged(SIGNAL),
+}
 
 
 def check_form(

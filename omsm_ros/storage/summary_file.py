@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import COUNTER, SAMPLE_PERIOD, SIGNAL, STAMP
 from omsm_ros.storage.result_folder import read_result
-from omsm_ros.storage.schemas import check_form, ranged
+from omsm_ros.storage.schemas import (
+    CONFORMITY,
+    FIGURE,
+    KNOWN_OR_NOT,
+    TEXT,
+    TEXTS,
+    check_form,
+    group,
+    or_none,
+    ranged,
+    rows,
+)
 
-_TEXT = {"type": "string"}
-_TEXTS = {"type": "array", "items": _TEXT}
 _ANY = {"type": "object"}
 _COUNT, _NUMBER = ranged(COUNTER), ranged(SIGNAL)
-
-
-def _group(needed: Mapping[str, Any], **others: Any) -> dict[str, Any]:
-    """Return the schema of an object; it may hold more, which nobody reads."""
-    return {"type": "object", "properties": {**needed, **others}, "required": list(needed)}
-
-
-def _rows(needed: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": _group(needed)}
-
-
-def _or_none(schema: Mapping[str, Any]) -> dict[str, Any]:
-    return {**schema, "type": [schema["type"], "null"]}
-
-
-# What a correction could not know it writes as null.
-_KNOWN_OR_NOT = _or_none(_NUMBER)
-_ERROR = _group({"rms": _KNOWN_OR_NOT, "peak_to_valley": _KNOWN_OR_NOT})
-_DEVIATION = _group({"peak_to_valley": _KNOWN_OR_NOT, "rms_area_weighted": _KNOWN_OR_NOT})
-_FIGURE = _group({"value": _KNOWN_OR_NOT, "uncertainty": _KNOWN_OR_NOT})
-_STREAM = _group(
+_ERROR = group({"rms": KNOWN_OR_NOT, "peak_to_valley": KNOWN_OR_NOT})
+_DEVIATION = group({"peak_to_valley": KNOWN_OR_NOT, "rms_area_weighted": KNOWN_OR_NOT})
+_STREAM = group(
     {
         "received": _COUNT,
         "corrected": _COUNT,
@@ -44,55 +34,54 @@ _STREAM = _group(
     pending=_COUNT,
 )
 _SOURCE = {
-    "source": _TEXT, "says": _TEXT, "kind": _TEXT, "status": _TEXT, "unit": _TEXT,
-    "reason": _TEXT, "standard_uncertainty": _KNOWN_OR_NOT, "height": _KNOWN_OR_NOT,
+    "source": TEXT, "says": TEXT, "kind": TEXT, "status": TEXT, "unit": TEXT,
+    "reason": TEXT, "standard_uncertainty": KNOWN_OR_NOT, "height": KNOWN_OR_NOT,
 }  # fmt: skip
 _LIMIT = {
-    "name": _TEXT, "unit": _TEXT, "value": _KNOWN_OR_NOT, "allowed": _KNOWN_OR_NOT,
+    "name": TEXT, "unit": TEXT, "value": KNOWN_OR_NOT, "allowed": KNOWN_OR_NOT,
     "speed_factor": _NUMBER,
 }  # fmt: skip
 _LIGHT = {
     "level": {"enum": ["green", "amber", "red"]},
-    "word": _TEXT,
-    "reasons": _rows({"what": _TEXT, "remedy": _TEXT}),
+    "word": TEXT,
+    "reasons": rows({"what": TEXT, "remedy": TEXT}),
 }
-_CONFORMITY = {"verdict": {"enum": ["holds", "fails", "cannot tell"]}, "tolerance": _NUMBER}
-_FORM = _group(
+_FORM = group(
     {},
-    bag=_TEXT,
-    calibration=_TEXT,
+    bag=TEXT,
+    calibration=TEXT,
     sample_period=ranged(SAMPLE_PERIOD),
     samples={"type": "object", "additionalProperties": _STREAM},
-    warnings=_TEXTS,
+    warnings=TEXTS,
     settings=_ANY,
     versions=_ANY,
     files=_ANY,
-    admission=_or_none(_ANY),
-    conditions=_group(
+    admission=or_none(_ANY),
+    conditions=group(
         {},
-        recorded_ns=_or_none(ranged(STAMP)),
-        calibration_age=_KNOWN_OR_NOT,
-        temperature=_or_none(_ANY),
+        recorded_ns=or_none(ranged(STAMP)),
+        calibration_age=KNOWN_OR_NOT,
+        temperature=or_none(_ANY),
     ),
-    prediction=_or_none(
-        _group(
+    prediction=or_none(
+        group(
             {},
-            limits=_rows(_LIMIT),
-            not_evaluated=_TEXTS,
-            speed_factor=_KNOWN_OR_NOT,
+            limits=rows(_LIMIT),
+            not_evaluated=TEXTS,
+            speed_factor=KNOWN_OR_NOT,
         )
     ),
-    dynamic_error_before=_or_none(_ERROR),
-    dynamic_error_after=_or_none(_ERROR),
-    deviation=_or_none(_group({}, raw=_or_none(_DEVIATION), corrected=_or_none(_DEVIATION))),
-    uncertainty=_group({}, median=_KNOWN_OR_NOT, largest=_KNOWN_OR_NOT),
-    budget=_or_none(_group({}, sources=_rows(_SOURCE))),
-    light=_or_none(_group(_LIGHT)),
-    form=_or_none(
-        _group(
+    dynamic_error_before=or_none(_ERROR),
+    dynamic_error_after=or_none(_ERROR),
+    deviation=or_none(group({}, raw=or_none(_DEVIATION), corrected=or_none(_DEVIATION))),
+    uncertainty=group({}, median=KNOWN_OR_NOT, largest=KNOWN_OR_NOT),
+    budget=or_none(group({}, sources=rows(_SOURCE))),
+    light=or_none(group(_LIGHT)),
+    form=or_none(
+        group(
             {},
-            deviation={"type": "object", "additionalProperties": _FIGURE},
-            conformity=_or_none(_group(_CONFORMITY)),
+            deviation={"type": "object", "additionalProperties": FIGURE},
+            conformity=or_none(group(CONFORMITY)),
         )
     ),
 )

@@ -156,9 +156,10 @@ def dragged(form: Mapping[str, Any], name: str) -> str:
     if not shares:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
-    own, *others = (
-        f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v
-    )
+    told = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v]
+    if len(told) < 2:
+        return ""
+    own, *others = told
     return f"; {own} would go with {', '.join(others)}, at the same form"
 
 
