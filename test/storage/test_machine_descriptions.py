@@ -44,8 +44,8 @@ def test_a_geometry_comes_back_to_the_last_bit_and_any_yaml_reads_it(tmp_path_fa
 
 @pytest.mark.parametrize("name", [f.name for f in fields(MachineLimits)])
 def test_each_limit_is_read_under_its_own_name_and_no_other_changes(file, name):
-    found = load_limits(file(f"{name}: 12.5\n"))
-    assert getattr(found, name) == 12.5
+    found = load_limits(file(f"{name}: 0.5\n"))
+    assert getattr(found, name) == 0.5
     others = {n: v for n, v in asdict(found).items() if n != name}
     assert others == {n: v for n, v in asdict(MachineLimits()).items() if n != name}
 
@@ -55,9 +55,9 @@ def test_each_limit_is_read_under_its_own_name_and_no_other_changes(file, name):
     [
         ("servo: 50\n", r"'servo' is unknown, expected one of \['exposure', 'motion_frequency'"),
         ("z_jerk: fast\n", "z_jerk is 'fast', expected a number; write digits with a decimal"),
-        ("z_jerk: 0\n", "z_jerk is 0, expected a number from 1e-12 to 1e"),
-        ("z_jerk: -3.0\n", "z_jerk is -3.0, expected a number"),
-        ("exposure: 1e13\n", "exposure is 1.*give it in the unit of its name"),
+        ("z_jerk: 0\n", "z_jerk is 0 .*expected a number from"),
+        ("z_jerk: -3.0\n", "z_jerk is -3.0 .*expected a number"),
+        ("exposure: 1e13\n", "exposure is 1.*give it in seconds"),
         ("- 3\n", "expected 'name: value' lines"),
     ],
 )
