@@ -18,10 +18,11 @@ NM = 1e-9
 def scan(
     rate=1000.0, pace=0.04, turning=0.5, seconds=20.0, lines=(), path_like=TIME, sigma=0.1 * NM,
     feed=1e-4, name="A", felt=None, on_circle=False,
+    rings=(0.0, 0.0),
 ):  # fmt: skip
     """``pace`` [m/s] along the path, ``turning`` [turns/s], ``feed`` [m/turn], so many ``seconds``.
 
-    sigma: of the amplitude of a line [m]
+    sigma: of the amplitude of a line [m];  rings: the radii at which it begins and ends [m]
     """
     ends = np.array([0.0, seconds])
 
@@ -32,15 +33,23 @@ def scan(
         TIME: coordinate(TIME, 1.0, TIME, rate / 2),
         PATH: coordinate(PATH, pace, path_like, rate / 2 / pace),
         TURN: coordinate(TURN, turning, TIME, rate / 2 / turning),
-        RADIUS: coordinate(RADIUS, feed * turning, TIME, rate / 2 / (feed * turning)),
     }
+    if feed:
+        crossing = feed * turning
+        coordinates[RADIUS] = coordinate(RADIUS, crossing, TIME, rate / 2 / crossing)
     count = round(seconds * rate)
     # Looked at are its rate, its turns and how many samples it has.
     few = np.arange(count) if path_like == PATH else np.array([0, count - 1])
     at, turn = np.zeros(len(few)), np.linspace(0.0, turning * seconds, len(few))
     return SimpleNamespace(
         signal=ScanSignal(
-            name=name, period=1 / rate, sample=few, height=at, path=at, radius=at, turn=turn
+            name=name,
+            period=1 / rate,
+            sample=few,
+            height=at,
+            path=at,
+            radius=np.linspace(*rings, len(few)),
+            turn=turn,
         ),
         coordinates=coordinates,
         lines=tuple(lines),
@@ -71,4 +80,6 @@ def seen_by(one, over, frequency, amplitude=5 * NM):
     if over != "t":  # a sample averages over its period
         amplitude *= abs(np.sinc(in_time * one.signal.period))
     at = folded(in_time, one.signal.rate)
-    return line(at, amplitude, **{n: at / one.coordinates[n].pace for n in (PATH, TURN, RADIUS)})
+    return line(
+        at, amplitude, **{n: at / one.coordinates[n].pace for n in one.coordinates if n != TIME}
+    )

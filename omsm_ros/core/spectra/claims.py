@@ -197,17 +197,33 @@ class Settled:
         size = self.evidence[key].line.amplitude
         for partner in claim.partners:
             ratio = self.evidence[partner].line.amplitude / size
+            theirs = self._as_theirs(partner, claim, key)
             if partner in self.claim:
                 if _family(self.claim[partner].kind) != _family(claim.kind):
-                    self.also.setdefault(partner, claim)
-            elif _EXPLAINED[0] <= ratio <= _EXPLAINED[1]:
-                own = [
-                    c
-                    for c in self.evidence[partner].claims
-                    if _family(c.kind) == _family(claim.kind) and key in c.partners
-                ]
-                if own:
-                    self.claim[partner] = max(own, key=lambda c: c.kind == ARTEFACT)
+                    self.also.setdefault(partner, theirs or claim)
+            elif theirs is not None and _EXPLAINED[0] <= ratio <= _EXPLAINED[1]:
+                self.claim[partner] = theirs
+                self._note_besides(partner, theirs)
+
+    def _note_besides(self, key: Key, claim: Claim) -> None:
+        """Note what else a line holds by what was decided of its partners before it."""
+        for other in self.evidence[key].claims:
+            if _family(other.kind) != _family(claim.kind) and any(
+                partner in self.claim
+                and _family(self.claim[partner].kind) == _family(other.kind)
+                and key in self.claim[partner].partners
+                for partner in other.partners
+            ):
+                self.also.setdefault(key, other)
+
+    def _as_theirs(self, partner: Key, claim: Claim, key: Key) -> Claim | None:
+        """Return ``partner``'s own claim to be what ``key`` is by ``claim``; it names ``key``."""
+        own = [
+            c
+            for c in self.evidence[partner].claims
+            if _family(c.kind) == _family(claim.kind) and key in c.partners
+        ]
+        return max(own, key=lambda c: c.kind == ARTEFACT, default=None)
 
 
 def settled(scans: Sequence[StudiedScan], evidence: dict[Key, Evidence]) -> Settled:
