@@ -15,6 +15,8 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 _LEAST_READINGS_A_LEVEL = 3.0
 # Of a step squared: this much is lost in any noise.
 _NOTHING = 1e-4
+# Their sum without noise is that of all but for half a per cent.
+_HARMONICS = 100
 # Gaps between levels are whole steps, but for the rounding of decimals.
 _WHOLE = 0.05
 
@@ -41,8 +43,9 @@ def plateaus(steps: Steps, used: BoolArray) -> IntArray:
 def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> float:
     """Return the variance [m²] of the error of rounding that all readings of a plateau share.
 
-    The error is periodic in the position; noise σ weakens its first harmonic, q/π, as
-    exp(-2π²σ²/q²) (Widrow and Kollár 2008, ch. 19). readings: (k,), plateau: (k,)
+    The error is periodic in the position; noise σ weakens its harmonic k, q/πk, as
+    exp(-2π²k²σ²/q²) (Widrow and Kollár 2008, ch. 19); without noise their sum is q²/12.
+    readings: (k,), plateau: (k,)
     """
     resting = plateau >= 0
     if step == 0 or not np.any(resting):
@@ -52,5 +55,7 @@ def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> fl
     spread = float(np.mean((readings - mean[plateau])[resting] ** 2))
     # Of a reading that never changes all noise may be hidden; of others rounding adds its own.
     noise = max(spread - step**2 / 12, 0.0)
-    shared = step**2 / (2 * np.pi**2) * np.exp(-4 * np.pi**2 * noise / step**2)
-    return float(min(shared, step**2 / 12)) if shared > _NOTHING * step**2 else 0.0
+    harmonic = np.arange(1, _HARMONICS + 1)
+    weakened = np.exp(-4 * np.pi**2 * harmonic**2 * noise / step**2) / harmonic**2
+    shared = step**2 / (2 * np.pi**2) * float(np.sum(weakened))
+    return shared if shared > _NOTHING * step**2 else 0.0
