@@ -73,13 +73,15 @@ def fit_clock(blocks: Sequence[Block]) -> Clock:
     drift = float(centred @ late / (centred @ centred))
     offset = float(late.mean() - drift * count.mean())
     jitter = float(np.std(late - offset - drift * count)) / NANOSECONDS_PER_S
-    # Few blocks with jitter say little about the rate; then the stated one stands.
     uncertain = jitter * NANOSECONDS_PER_S / np.sqrt(float(centred @ centred))
     if abs(drift) > _MAX_RATE_ERROR * nominal + 5 * uncertain:
         raise DataError(
             f"stamps advance by {nominal + drift!r} ns a sample, the blocks state {nominal!r} ns; "
             "stamps of a recording in time lapse cannot join two clocks"
         )
+    if abs(drift) > _MAX_RATE_ERROR * nominal:
+        # Few blocks with jitter say little about the rate: the stated one stands.
+        offset, drift = float(late.mean()), 0.0
     return Clock(first, start, offset, nominal + drift, jitter)
 
 

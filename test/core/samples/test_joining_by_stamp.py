@@ -126,6 +126,25 @@ def test_stamps_in_time_lapse_are_refused() -> None:
         fit_clock(blocks)
 
 
+@pytest.mark.parametrize("last_ms", [0, -200, 150, 600])
+def test_a_few_stamps_that_scatter_say_nothing_of_the_rate(last_ms: int) -> None:
+    """A line through three stamps, one of them a second late, would let time fall."""
+    still = np.zeros(100)
+    blocks = [
+        AxisBlock(
+            stamp_ns=stamp * 1_000_000,
+            first_sample=100 * k,
+            sample_period=1e-3,
+            **dict.fromkeys("xyzbc", still),
+        )
+        for k, stamp in enumerate((500, 1500, 500 + last_ms))
+    ]
+    clock = fit_clock(blocks)
+    assert clock.period_ns == 1e6
+    assert clock.since(np.array([100.0]), 0)[0] == pytest.approx((2.5 + last_ms / 1e3) / 3)
+    axes_at_probe(blocks, probe_blocks())
+
+
 def test_what_the_axes_do_not_cover_is_no_number() -> None:
     axes = axis_blocks()
     found = axes_at_probe(axes[:30] + axes[40:], probe_blocks(start=-0.05))
