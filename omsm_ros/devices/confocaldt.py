@@ -203,7 +203,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
             )
         said = port.ask("MEASRATE", "\n")
-        told = [float(number) for number in re.findall(r"\d+\.?\d*", said) if float(number) > 0]
+        told = [float(number) for number in re.findall(r"\d+(?:\.\d*)?", said) if float(number) > 0]
         if not told:
             raise DeviceError(
                 f"{self._transport.name} did not tell its measuring rate ({said[-64:]!r}); check "

@@ -31,7 +31,8 @@ from omsm_ros.protocols.chrocodile_telegram import (
 _NEAR = 16
 # Of several places, one where the counter has gone on so often is believed [telegrams].
 _DEEP = 8
-_NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# In one way only: digits that could be split anywhere are tried in every way, for hours.
+_NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 @dataclass(frozen=True, slots=True)

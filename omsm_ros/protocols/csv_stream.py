@@ -24,7 +24,7 @@ _WHOLE = ("sequence", "device_time", "status")
 # A longer line is none.
 MAX_LINE_BYTES = 1024
 _INTEGER = re.compile(rb"[-+]?\d{1,19}")
-_NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NUMBER = re.compile(rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 _SEPARATOR = re.compile(rb"[,;\s]+")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -314,3 +315,15 @@ def test_noise_on_lines_raises_nothing(portions: list[bytes]) -> None:
     total = made.statistics
     assert total.bytes_discarded >= 0
     assume(portions)
+
+
+@pytest.mark.parametrize("end", [b"x", b"", b" 1"])
+def test_long_runs_of_digits_are_no_telegram_at_once(end: bytes) -> None:
+    """Each of ten numbers could be split in four hundred ways: a line was tried for hours."""
+    layout = Layout.of(tuple(range(64, 74)))
+    started = time.process_time()
+    made = LineDecoder(layout)
+    garbled = b" ".join([b"", *[b"9" * 390] * 10])
+    assert len(made.feed(b" 0" * 10 + b"\r\n" + garbled + end + b"\r\n")) == 1
+    assert made.statistics.losses_of_sync == 1
+    assert time.process_time() - started < 1.0
