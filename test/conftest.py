@@ -6,6 +6,7 @@ And their order: several processes share the tests, a file each, and files with 
 import signal
 
 import hypothesis
+import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.calibration import Calibration
@@ -22,8 +23,26 @@ def pytest_configure():
     """
     hypothesis.settings.register_profile("whole tests are timed", deadline=None)
     hypothesis.settings.load_profile("whole tests are timed")
+    pytest.approx = approx
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+_APPROX = pytest.approx
+_SMALL = 1e-10
+
+
+def approx(expected, rel=None, abs=None, nan_ok=False):
+    """As ``pytest.approx``, which takes all within 1e-12 for equal: not where values are as small.
+
+    A square of nanometres would equal any other.
+    """
+    if abs is None:
+        values = list(expected.values()) if isinstance(expected, dict) else expected
+        sizes = np.abs(np.asarray(values, dtype=float))
+        largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
+        assert not 0 < largest < _SMALL, f"state rel and abs=0 for {largest}"
+    return _APPROX(expected, rel=rel, abs=abs, nan_ok=nan_ok)
 
 
 # A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000.

@@ -33,8 +33,8 @@ from omsm_ros.core.fitting.output_error import Fit, fit
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 
-# Samples that are used, on which is chosen: thirty for each parameter of the highest order.
-CHOSEN_ON = 2000
+# Samples that are used, on which is chosen: eighty for each parameter of the highest order.
+CHOSEN_ON = 5000
 # Parts that are compared in how much they tell.
 _MOST_PARTS = 16
 # Fitted to the whole in any case: what is slower than a part.

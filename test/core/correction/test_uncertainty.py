@@ -231,7 +231,7 @@ def test_contributions_by_hand() -> None:
     assert found["static_gain"] == pytest.approx([0.0, 1.6**2])
     assert found["discretisation"] == 25.0
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
-    assert found["pitch"] == pytest.approx((200e-9) ** 2)
+    assert found["pitch"] == pytest.approx((200e-9) ** 2, rel=1e-6, abs=0)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
     assert found["could_hide"] == pytest.approx([5.0, 6.0])
     assert found["lateral_lag"] == pytest.approx([81e-6, 100e-6])

@@ -222,7 +222,7 @@ def test_a_declared_latency_is_read_back_as_it_was_stated(
     stated = declared(lag, share * lag, u, "data sheet")
     found = latency_of(with_latency(made(), stated))
     assert found == stated == Latency.of_entry(json.loads(json.dumps(stated.entry())))
-    assert found.share == pytest.approx(share)
+    assert found.share == pytest.approx(share, rel=1e-6, abs=0)
     assert found.beside_z_s == found.uncertainty_s == u
 
 

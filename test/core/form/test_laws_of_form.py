@@ -121,8 +121,8 @@ def test_figures_of_the_part_scale_with_heights_and_all_their_errors(scale):
         (rms_of_part(other), *extents_of_part(other, DISC)),
         strict=True,
     ):
-        assert two.value == pytest.approx(scale * one.value, rel=1e-9)
-        assert two.uncertainty == pytest.approx(scale * one.uncertainty, rel=1e-6)
+        assert two.value == pytest.approx(scale * one.value, rel=1e-9, abs=0)
+        assert two.uncertainty == pytest.approx(scale * one.uncertainty, rel=1e-6, abs=0)
 
 
 def test_the_rms_of_the_part_is_without_noise_and_without_the_square_of_errors():

@@ -244,7 +244,9 @@ class TestHidden:
 
     def test_what_is_carried_holds_estimate_and_uncertainty(self):
         for term in hidden_terms(survey_of(crept(6e-5, 1.0))):
-            assert term.carried**2 == pytest.approx(term.size**2 + term.uncertainty**2)
+            assert term.carried**2 == pytest.approx(
+                term.size**2 + term.uncertainty**2, rel=1e-6, abs=0
+            )
 
     def test_the_gain_above_rest_is_open_in_the_covariance(self):
         hidden = hidden_terms(survey_of())[0]

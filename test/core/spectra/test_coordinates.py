@@ -94,7 +94,7 @@ class TestPower:
         signal = scan()
         values = 3e-9 * np.sin(2 * np.pi * 40.0 * TIMES + 1)
         power, spacing = power_over(signal, values, coordinates_of(signal)[TIME])
-        assert power[round(40.0 / spacing)] == pytest.approx(9e-18, rel=1e-9)
+        assert power[round(40.0 / spacing)] == pytest.approx(9e-18, rel=1e-9, abs=0)
 
     def test_over_time_it_is_the_sum_over_the_samples_there_are(self):
         rng = np.random.default_rng(1)

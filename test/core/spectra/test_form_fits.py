@@ -140,7 +140,7 @@ class TestOrders:
         (order,) = [one for one in found.orders if one.order == 3]
         assert order.cosine == pytest.approx(9 * NM, abs=4 * order.uncertainty)
         # Of white noise on a circle: the bound of a sum of cosines.
-        assert order.uncertainty == pytest.approx(1 * NM * np.sqrt(2 / COUNT), rel=0.1)
+        assert order.uncertainty == pytest.approx(1 * NM * np.sqrt(2 / COUNT), rel=0.1, abs=0)
 
     def test_orders_go_to_twelve(self):
         assert {one.order for one in without_form(scan()).orders} <= set(range(2, 13))

@@ -39,7 +39,7 @@ def test_drift_is_found_though_a_third_is_wrong():
     values[::4] += 50e-9
     found = trend(times, values)
     assert found.significant
-    assert found.slope == pytest.approx(2e-15, rel=0.1)
+    assert found.slope == pytest.approx(2e-15, rel=0.1, abs=0)
 
 
 def test_noise_alone_drifts_in_one_of_twenty():
@@ -65,7 +65,7 @@ def test_of_very_many_points_some_tell_the_slope_of_all():
     assert found.slope == pytest.approx(2e-15, abs=4 * 1e-10 * np.sqrt(12 / 1000) / 1e6)
     assert found.low < 2e-15 < found.high
     assert found.high - found.low == pytest.approx(
-        2 * 1.96 * 1e-10 * np.sqrt(12 / 1000) / 1e6, rel=0.15
+        2 * 1.96 * 1e-10 * np.sqrt(12 / 1000) / 1e6, rel=0.15, abs=0
     )
 
 
