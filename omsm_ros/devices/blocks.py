@@ -17,6 +17,7 @@ from omsm_ros.core.samples.blocks import (
 )
 from omsm_ros.devices.clock import DeviceClock
 from omsm_ros.devices.counting import SAMPLE, Run, Samples
+from omsm_ros.devices.turns import Turns
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.generic_stream import AXES, AxisScaling
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
@@ -93,7 +94,7 @@ class BlockCutter:
         self._clock = DeviceClock()
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
-        self._turned: list[int] | None = None
+        self._turns = [Turns(axis.wrap) for axis in channels.axes or ()]
         self.delivered = self.withheld = self.blocks = self.period_warnings = 0
         self.period_deviation = 0.0
 
@@ -200,10 +201,10 @@ class BlockCutter:
     def _positions(
         self, samples: Samples, scaling: tuple[AxisScaling, ...]
     ) -> dict[str, FloatArray]:
-        counts = samples["counts"]
-        previous = self._turned or counts[0].tolist()
-        turned = [axis.unwrap(counts[:, i], previous[i]) for i, axis in enumerate(scaling)]
-        self._turned = [int(column[-1]) for column in turned]
+        turned = [
+            turns.continued(counts)
+            for turns, counts in zip(self._turns, samples["counts"].T[: len(scaling)], strict=True)
+        ]
         return {
             name: axis.values(column)
             for name, axis, column in zip(AXES, scaling, turned, strict=True)

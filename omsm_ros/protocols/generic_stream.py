@@ -175,17 +175,6 @@ class AxisScaling:
         whole = _integers("axis position", scaled, np.int64).astype(np.int64)
         return whole % self.wrap if self.wrap else whole
 
-    def unwrap(self, counts: IntArray, previous: int) -> IntArray:
-        """Return the counts (n,) continued from ``previous``, the last unwrapped count.
-
-        The axis moves less than half a wrap between two samples.
-        """
-        if not self.wrap:
-            return counts
-        half = self.wrap // 2
-        steps = (np.diff(counts, prepend=previous) + half) % self.wrap - half
-        return previous + np.cumsum(steps)
-
 
 @dataclass(frozen=True, slots=True)
 class ProbeScaling:

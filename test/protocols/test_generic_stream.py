@@ -223,24 +223,6 @@ def test_axis_scaling_by_hand() -> None:
     np.testing.assert_array_equal(axis.counts(np.array([2.0, 1.5])), [0, 500])
 
 
-@given(
-    st.integers(10, 2**33),
-    st.integers(-(2**40), 2**40),
-    st.lists(st.floats(-0.49, 0.49), min_size=1, max_size=40),
-    st.data(),
-)
-def test_wrapped_counts_are_continued_across_any_cut(
-    wrap: int, start: int, fractions: list[float], data: st.DataObject
-) -> None:
-    axis = AxisScaling(1e3, wrap=wrap)
-    steps = [int(f * wrap) for f in fractions]
-    truth = start + np.cumsum([0, *steps])
-    cut = data.draw(st.integers(1, len(truth)))
-    head = axis.unwrap(truth[:cut] % wrap, int(truth[0]))
-    tail = axis.unwrap(truth[cut:] % wrap, int(head[-1]))
-    np.testing.assert_array_equal(np.concatenate([head, tail]), truth)
-
-
 def test_a_wrapping_encoder_reports_within_one_turn() -> None:
     axis = AxisScaling(3600 / (2 * np.pi), wrap=3600)
     assert axis.counts(np.array([2 * np.pi * 5.25, -np.pi / 2])).tolist() == [900, 2700]
