@@ -39,7 +39,7 @@ def approx(expected, rel=None, abs=None, nan_ok=False):
     """
     if abs is None:
         values = list(expected.values()) if isinstance(expected, dict) else expected
-        sizes = np.abs(np.asarray(values, dtype=float))
+        sizes = np.abs(np.asarray(values, dtype=complex))
         largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
         assert not 0 < largest < _SMALL, f"state rel and abs=0 for {largest}"
     return _APPROX(expected, rel=rel, abs=abs, nan_ok=nan_ok)

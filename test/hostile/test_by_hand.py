@@ -217,7 +217,7 @@ def test_a_start_before_1970_is_refused(place):
 
 def test_a_light_beyond_single_precision_is_no_light(place):
     table = b"n,d,i\n" + b"".join(
-        b"%d,1e-6,%s\n" % (k, b"1e300" if k == 7 else b"80") for k in range(20)
+        b"%d,1e-6,%s\n" % (k, b"1e300" if k == 7 else b"0.8") for k in range(20)
     )
     columns = {"trigger": {"name": "n"}, "distance": {"name": "d", "unit": "m"},
                "intensity": {"name": "i", "unit": "1"}}  # fmt: skip
