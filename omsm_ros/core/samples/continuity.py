@@ -125,14 +125,26 @@ class StampLine:
                 return True
         return False
 
-    @property
-    def coming(self) -> tuple[int, int, int] | None:
-        """Session, first count and stamp of the next block; None before it is there."""
-        return self._coming[0] if self._coming else None
+    def in_step(
+        self, other: StampLine, sessions: tuple[int, int], end: int, tolerance_ns: float
+    ) -> list[tuple[int, int, int]]:
+        """Go to the last of the next blocks below ``end`` that two lines have in common.
 
-    def go_on(self) -> None:
-        """Go to the next block."""
-        self._current = self._coming.popleft()
+        Return the first count of each, its stamp here, and how much earlier the other's is [ns].
+        """
+        mine, others = self._coming, other._coming
+        one, two = sessions
+        taken: list[tuple[int, int, int]] = []
+        while mine and others:
+            session, count, stamp = mine[0]
+            their_session, their_count, their_stamp = others[0]
+            if not (their_count == count < end and session == one and their_session == two):
+                break
+            if abs(stamp - their_stamp) > tolerance_ns:
+                break
+            self._current, other._current = mine.popleft(), others.popleft()
+            taken.append((count, stamp, stamp - their_stamp))
+        return taken
 
     def leaps(self, session: int, count: int, period_ns: float) -> bool:
         """Return whether the block that begins at ``count``, if one does, comes after a pause."""

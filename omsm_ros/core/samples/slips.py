@@ -181,25 +181,20 @@ class SlipWatch:
         """
         if not self._common or self._starting or self._odd or self._state.samples:
             return False
-        (axes, distance), (a, d) = self._lines, self.sessions
-        taken = False
-        while (late := axes.coming) is not None and (early := distance.coming) is not None:
-            count, skew = late[1], late[2] - early[2]
-            in_step = early[1] == count < end and late[0] == a and early[0] == d
-            if not in_step or abs(skew) > _SAME_NS:
-                break
-            axes.go_on()
-            distance.go_on()
-            stride = int(count // max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0))
-            if stride != self._judged:
-                self._judged = stride
-                self._since = count - _SPAN_S * NANOSECONDS_PER_S / period_ns
+        axes, distance = self._lines
+        taken = axes.in_step(distance, self.sessions, end, _SAME_NS)
+        if not taken:
+            return False
+        per_s = NANOSECONDS_PER_S / period_ns
+        stride = max(_STRIDE_S * per_s, 1.0)
+        for count, _, skew in taken:
+            if (judged := int(count // stride)) != self._judged:
+                self._judged, self._since = judged, count - _SPAN_S * per_s
                 self._wander.append(skew)
-            self._stamps = [stamps + 1 for stamps in self._stamps]
-            self._shown = [count, count]
-            self._seen.append((count, skew, True, True, late[2]))
-            taken = True
-        return taken
+        self._stamps = [stamps + len(taken) for stamps in self._stamps]
+        self._shown = [taken[-1][0]] * 2
+        self._seen.extend((n, skew, True, True, at) for n, at, skew in taken[-_MOST_STAMPS:])
+        return True
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as it can be told."""

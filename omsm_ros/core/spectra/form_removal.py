@@ -109,14 +109,20 @@ class FormFit:
             energy = float(np.sum(values[self._chosen] ** 2))
             degree = _enough(basis, gram, moment, energy, worth)
             # Of what that leaves, for rounding of millimetres would look like form of its own.
-            solution = _solved(gram, moment, basis.within(degree))
-            left = values - _evaluated(basis.up_to(degree), self._signal, solution)
-            _, moment = _normal_equations(basis, self._signal, left, self._chosen)
-            energy = float(np.sum(left[self._chosen] ** 2))
-            degree = _beyond(basis, gram, moment, energy, worth, degree)
+            kept = basis.within(degree)
+            some = self._some()
+            columns = basis.columns(self._signal, some)
+            left = values[some] - columns[:, kept] @ _solved(gram, moment, kept)
+            gram, moment = columns.T @ columns, columns.T @ left
+            degree = _beyond(basis, gram, moment, float(left @ left), worth, degree)
             if degree < top:
                 break
         return degree
+
+    def _some(self) -> np.ndarray:
+        """Return the samples that show whether a degree is worth it: drawn, to fold nothing."""
+        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
+        return np.asarray(self._chosen[np.sort(drawn)])
 
     def refine(self, heights: FloatArray) -> None:
         """Choose the degree again, once the ``heights`` of all lines (n,) [m] are known."""
