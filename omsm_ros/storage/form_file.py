@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from omsm_ros.storage.schemas import (
     TEXT,
     TEXTS,
     check_form,
+    each,
     group,
     or_none,
     ranged,
@@ -30,26 +30,20 @@ _SQUARE = {"type": "number", "minimum": 0, "maximum": SIGNAL.high}
 _ARRAY = {"type": "array"}
 _AGAIN = "register the part again"
 
-
-def _each(schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an object of any names whose values follow ``schema``."""
-    return {"type": "object", "additionalProperties": schema}
-
-
 _REMOVED = group(
     {},
     fitted=TEXTS,
     notes=TEXTS,
     not_evaluated=TEXTS,
-    held=_each(TEXT),
-    not_determined=_each(TEXT),
-    pose_uncertainty=_each(_each(_NUMBER)),
+    held=each(TEXT),
+    not_determined=each(TEXT),
+    pose_uncertainty=each(each(_NUMBER)),
 )
 _TERM = {"n": {"type": "integer"}, "m": {"type": "integer"}, **FIGURE["properties"]}
 _FORM = group(
     {"zernike": rows(_TERM)},
-    deviation=_each(FIGURE),
-    pose=_each(FIGURE),
+    deviation=each(FIGURE),
+    pose=each(FIGURE),
     removed=_REMOVED,
     conformity=or_none(group(CONFORMITY)),
 )
@@ -65,7 +59,7 @@ _DENSITY = group(
     },
     areal=group(dict.fromkeys(("x", "y", "value"), _ARRAY)),
 )
-_CURVES = group({}, profiles=_each(_CURVE), psd=or_none(_DENSITY))
+_CURVES = group({}, profiles=each(_CURVE), psd=or_none(_DENSITY))
 
 
 def read_form(path: Path) -> dict[str, Any]:

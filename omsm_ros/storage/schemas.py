@@ -30,6 +30,11 @@ def form(properties: Mapping[str, Any], required: Sequence[str]) -> dict[str, An
     }
 
 
+def each(schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of an object of any names whose values follow ``schema``."""
+    return {"type": "object", "additionalProperties": schema}
+
+
 def ranged(quantity: Quantity) -> dict[str, Any]:
     """Return the schema of a number within the range of ``quantity``, in its unit."""
     kind = "integer" if quantity.whole else "number"

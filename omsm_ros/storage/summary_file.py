@@ -15,6 +15,7 @@ from omsm_ros.storage.schemas import (
     TEXT,
     TEXTS,
     check_form,
+    each,
     group,
     or_none,
     ranged,
@@ -29,7 +30,7 @@ _STREAM = group(
     {
         "received": _COUNT,
         "corrected": _COUNT,
-        "counted": {"type": "object", "additionalProperties": _COUNT},
+        "counted": each(_COUNT),
     },
     pending=_COUNT,
 )
@@ -51,7 +52,7 @@ _FORM = group(
     bag=TEXT,
     calibration=TEXT,
     sample_period=ranged(SAMPLE_PERIOD),
-    samples={"type": "object", "additionalProperties": _STREAM},
+    samples=each(_STREAM),
     warnings=TEXTS,
     settings=_ANY,
     versions=_ANY,
@@ -80,7 +81,7 @@ _FORM = group(
     form=or_none(
         group(
             {},
-            deviation={"type": "object", "additionalProperties": FIGURE},
+            deviation=each(FIGURE),
             conformity=or_none(group(CONFORMITY)),
         )
     ),
