@@ -14,7 +14,6 @@ _LITTLE = 1 / 64
 # garbled counts so many do so by chance once in 10⁹.
 _ALIKE = 6
 
-
 _Steps = TypeVar("_Steps", IntArray, int)
 
 

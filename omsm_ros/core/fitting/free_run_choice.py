@@ -142,8 +142,8 @@ def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCan
 def proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
     """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
     scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
-    proposed = [scaled.of_discrete(poles) for poles in starts.poles(order)]
-    return [p for p in proposed if len(p) == order and np.all(np.isfinite(p))]
+    every = [scaled.of_discrete(poles) for poles in starts.poles(order)]
+    return [p for p in every if len(p) == order and np.all(np.isfinite(p))]
 
 
 def _highest_order(samples: int, order: int) -> int:

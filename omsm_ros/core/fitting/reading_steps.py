@@ -15,7 +15,7 @@ from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
 _LEAST_READINGS_A_LEVEL = 3.0
 # Of a step squared: this much is lost in any noise.
 _NOTHING = 1e-4
-# Their sum without noise is that of all but for half a per cent.
+# Of the error of rounding, that are added up: without noise all but 0.6 % of q²/12.
 _HARMONICS = 100
 # Gaps between levels are whole steps, but for the rounding of decimals.
 _WHOLE = 0.05
