@@ -38,6 +38,7 @@ def _repaired(bag: Path) -> Facts:
         "repaired": str(made.path),
         "messages": dict(made.messages),
         "lost": made.lost,
+        "lost_unnamed": made.unnamed,
     }
 
 
@@ -45,6 +46,8 @@ def _show(facts: Facts) -> None:
     if "repaired" in facts:
         saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
         lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
+        if more := facts["lost_unnamed"]:
+            lost.append(("lost", f"and {more} more places"))
         table([written([facts["repaired"]]), *saved, *lost])
         return
     row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"

@@ -35,18 +35,21 @@ _MOST_NAMED = 20
 class Repair:
     """What was saved, and what was not.
 
-    path: the new bag;  messages: saved, by topic;  lost: what could not be saved, and why
+    path: the new bag;  messages: saved, by topic;  lost: what could not be saved, and why, the
+    first twenty;  unnamed: how many others
     """
 
     path: Path
     messages: Counter[str] = field(default_factory=Counter)
     lost: list[str] = field(default_factory=list)
+    unnamed: int = 0
 
 
 def repair(path: Path) -> Repair:
     """Copy what is whole of an MCAP bag, a file or a folder, to ``<its name>.repaired.mcap``.
 
-    Raises BagError if that exists, or ``path`` is no MCAP bag; ``path`` itself is only read.
+    Raises BagError if that exists, or ``path`` is no MCAP bag or has no whole message, and then
+    leaves no file; ``path`` itself is only read.
     """
     parts = sorted(path.glob("*.mcap"), key=_number) if path.is_dir() else [path]
     if not parts:
@@ -59,15 +62,26 @@ def repair(path: Path) -> Repair:
         _check_magic(stream, parts[0])
     file = new_bag_file(made.path)
     try:
+        _copy(parts, file, made)
+    except BaseException:
+        made.path.unlink()
+        raise
+    finally:
+        file.close()
+    return made
+
+
+def _copy(parts: list[Path], file: IO[bytes], made: Repair) -> None:
+    try:
         writer = new_writer(file)
         for part in parts:
             _Copy(part, writer, made).run(file.flush)
         finish(writer, file)
     except OSError as err:
         raise BagError(f"cannot write {str(made.path)!r}: {said(err)}; make room") from err
-    finally:
-        file.close()
-    return made
+    if not made.messages:
+        why = made.lost[0] if made.lost else "nothing was recorded"
+        raise BagError(f"{str(parts[0])!r} has no whole message to save ({why}); record it again")
 
 
 def _beside(path: Path) -> Path:
@@ -169,6 +183,8 @@ class _Copy:
     def _lose(self, what: str) -> None:
         if len(self._made.lost) < _MOST_NAMED:
             self._made.lost.append(f"{self._path.name}: {what}")
+        else:
+            self._made.unnamed += 1
 
 
 def _check_records(data: bytes) -> None:

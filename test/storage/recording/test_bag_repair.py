@@ -20,6 +20,7 @@ from omsm_ros.storage.recording.bag_writer import BagWriter
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 BLOCKS, CHUNK = 24, 4
+MAGIC = b"\x89MCAP0\r\n"
 
 
 def first_samples(path, topic=bags.AXES_TOPIC):
@@ -57,14 +58,16 @@ def test_a_cut_bag_gives_all_but_the_chunk_that_was_cut(whole, small_scan_blocks
     assert len(ends) == BLOCKS // CHUNK
     for length in np.linspace(50, len(data), 40, dtype=int):
         whole.write_bytes(data[:length])
+        kept = CHUNK * sum(end <= length for end in ends)
+        if not kept:
+            with pytest.raises(BagError, match="the file was cut short there"):
+                repair(whole)
+            continue
         made = repair(whole)
-        chunks = sum(end <= length for end in ends)
-        kept = CHUNK * chunks
-        assert made.messages == (dict.fromkeys(TOPICS, kept) if kept else {})
+        assert made.messages == dict.fromkeys(TOPICS, kept)
         assert bool(made.lost) == (length < len(data) - 400)
-        if kept:
-            assert first_samples(made.path) == expected[:kept]
-            assert first_samples(made.path, bags.DISTANCE_TOPIC) == expected[:kept]
+        assert first_samples(made.path) == expected[:kept]
+        assert first_samples(made.path, bags.DISTANCE_TOPIC) == expected[:kept]
         assert whole.read_bytes() == data[:length]
         made.path.unlink()
 
@@ -149,7 +152,11 @@ def test_any_damage_is_survived_and_what_is_saved_is_true(whole, small_scan_bloc
         for place in random.integers(8, len(data), 3):
             damaged[place] ^= int(random.integers(1, 256))
         whole.write_bytes(damaged)
-        made = repair(whole)
+        try:
+            made = repair(whole)
+        except BagError as err:
+            assert "has no whole message to save" in str(err)
+            continue
         if made.messages[bags.AXES_TOPIC]:
             with bags.BagReader(made.path) as reader:
                 for _, block in reader.records(bags.AXES_TOPIC):
@@ -167,12 +174,30 @@ def chunk_of(data, compress):
 def test_chunks_of_zeros_are_lost_at_once(tmp_path):
     """Each nine of them are a record of no kind: a kilobyte would be a million of them."""
     path, compress = tmp_path / "zeros.mcap", storage_mcap.zstd.compress
-    path.write_bytes(b"\x89MCAP0\r\n" + chunk_of(bytes(10**6), compress) * 400)
+    path.write_bytes(MAGIC + chunk_of(bytes(10**6), compress) * 400)
     start = process_time()
-    made = repair(path)
+    with pytest.raises(BagError, match="a record of no kind at 0 of a chunk"):
+        repair(path)
     assert process_time() - start < 1.0
-    assert not made.messages
-    assert "a record of no kind at 0" in made.lost[0]
+
+
+def test_every_place_that_is_lost_is_counted(whole, small_scan_blocks):
+    """Twenty are named, and the others are a number."""
+    data = whole.read_bytes()
+    damage = chunk_of(bytes(90), storage_mcap.zstd.compress) * 33
+    whole.write_bytes(MAGIC + damage + data[len(MAGIC) :])
+    made = repair(whole)
+    assert (len(made.lost), made.unnamed) == (20, 13)
+    assert [axes.first_sample for axes, _ in small_scan_blocks[:BLOCKS]] == first_samples(made.path)
+
+
+@pytest.mark.parametrize("data", [MAGIC, MAGIC + bytes(9), MAGIC + b"\x05"], ids=repr)
+def test_what_holds_no_whole_message_is_refused_and_no_empty_bag_is_left(tmp_path, data):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data)
+    with pytest.raises(BagError, match="has no whole message to save"):
+        repair(path)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_chunks_that_unpack_to_more_than_a_recording_are_lost(tmp_path, monkeypatch):
@@ -183,7 +208,7 @@ def test_chunks_that_unpack_to_more_than_a_recording_are_lost(tmp_path, monkeypa
     known = struct.pack("<BQ", 3, 14) + schema + struct.pack("<BQ", 4, 16) + channel
     tiny = struct.pack("<BQ", 5, 22) + struct.pack("<HIQQ", 1, 0, 0, 0)
     chunks = (known + tiny * 10, *[tiny * 15_000] * 4)
-    path.write_bytes(b"\x89MCAP0\r\n" + b"".join(chunk_of(c, compress) for c in chunks))
+    path.write_bytes(MAGIC + b"".join(chunk_of(c, compress) for c in chunks))
     within = (10**6 + 100 * path.stat().st_size - len(chunks[0])) // len(chunks[1])
     assert within < 4
     made = repair(path)
