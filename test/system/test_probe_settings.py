@@ -19,60 +19,79 @@ from omsm_ros.storage.calibration_file import load_calibration
 pytestmark = [pytest.mark.timeout(180), pytest.mark.soak]
 
 
-def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
-    plan = demonstration.Demonstration(
-        cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=0.5e-3, device="chrocodile"
-    )
-    plan.prepare()
-    node, processes = cell.operator, cell.processes
+class Bench:
+    """A cell with a CHRocodile, whose driver begins anew with another averaging."""
 
-    def driver(averaging):
-        processes.start("confocal_driver", **plan.driver_parameters(), averaging=averaging)
-        listeners = 2 + ("recorder" in processes._running)
-        cell.wait("it", lambda: node.value("confocal_driver", "axes_subscribers") >= listeners)
-        cell.wait("the device", lambda: node.value("confocal_driver", "connections") >= 1)
+    def __init__(self, cell):
+        self.cell, self.node, self.processes = cell, cell.operator, cell.processes
+        self.plan = demonstration.Demonstration(
+            cell.folder / "demo", seed=2, time_lapse=20.0, start_radius=0.5e-3, device="chrocodile"
+        )
+        self.plan.prepare()
+        link, parameters = self.plan.link, self.plan.emulator_parameters()
+        self.processes.start("cell_emulator", link=link, **parameters)
+        output, stated = str(self.plan.calibration_file), json.dumps(self.plan.settings())
+        self.processes.start("calibrator", output=output, settings=stated)
+        self.processes.start("corrector")
 
-    def scanned(name, averaging):
-        """A bag of a scan with ``averaging``, and what the corrector says of it at the end."""
-        path = cell.folder / name
-        processes.end("confocal_driver")
-        processes.start("recorder", path=str(path))
-        driver(averaging)
-        cell.wait("the recorder", lambda: node.value("corrector", "points_subscribers") >= 1)
+    def driver(self, averaging):
+        parameters = self.plan.driver_parameters()
+        self.processes.start("confocal_driver", **parameters, averaging=averaging)
+        listeners = 2 + ("recorder" in self.processes._running)
+        self._until("it", "confocal_driver", "axes_subscribers", listeners)
+        self._until("the device", "confocal_driver", "connections", 1)
+
+    def _until(self, what, of, counted, count):
+        self.cell.wait(what, lambda: self.node.value(of, counted) >= count)
+
+    def recorded(self, name, averaging):
+        """The bag that is being written, of samples with ``averaging``."""
+        path = self.cell.folder / name
+        self.processes.end("confocal_driver")
+        self.processes.start("recorder", path=str(path))
+        self.driver(averaging)
+        self._until("the recorder", "corrector", "points_subscribers", 1)
         return path
 
-    processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
-    stated = json.dumps(plan.settings())
-    processes.start("calibrator", output=str(plan.calibration_file), settings=stated)
-    processes.start("corrector")
-    driver(4)
-    node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
-    _follow(node, "calibrator", ("axes_held", "distance_held"), plan.step_test_samples, int)
-    answer = node.call(Identify, "/omsm/calibrator/identify", Identify.Request())
-    settings = json.loads(answer.calibration.settings)
+    def move(self, motion):
+        self.node.call(Trigger, f"/omsm/cell_emulator/{motion}", Trigger.Request())
+
+    def identified(self):
+        """What the calibrator answers after a step test."""
+        self.move("step_test")
+        held = ("axes_held", "distance_held")
+        _follow(self.node, "calibrator", held, self.plan.step_test_samples, int)
+        return self.node.call(Identify, "/omsm/calibrator/identify", Identify.Request()).calibration
+
+
+def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
+    bench, node = Bench(cell), cell.operator
+    bench.driver(4)
+    identified = bench.identified()
+    settings = json.loads(identified.settings)
     assert settings["probe.device"] == "chrocodile"
     assert settings["probe.averaging"] == 4
     # Exposures just above four times the trigger, as four are averaged for each.
     assert settings["probe.rate"] == pytest.approx(4 * 1050, rel=1e-3)
-    cell.wait("it", lambda: node.text("corrector", "calibration") == answer.calibration.id)
+    cell.wait("it", lambda: node.text("corrector", "calibration") == identified.id)
 
-    foreign = scanned("foreign.mcap", 8)
+    foreign = bench.recorded("foreign.mcap", 8)
     said = "probe.averaging is 8.0, calibrated with 4.0"
     cell.wait("the refusal", lambda: said in node.text("corrector", "message"))
-    node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
+    bench.move("scan")
     cell.wait("samples", lambda: node.value("corrector", "distance_uncalibrated") > 1000)
     assert node.value("corrector", "clouds_published") == 0
-    node.call(Trigger, "/omsm/cell_emulator/stop", Trigger.Request())
-    processes.end("recorder")
-    calibration = load_calibration(plan.calibration_file)
+    bench.move("stop")
+    cell.processes.end("recorder")
+    calibration = load_calibration(bench.plan.calibration_file)
     with pytest.raises(CalibrationError, match=said):
         CorrectedScan(foreign, calibration, CorrectionOptions()).__enter__()
     assert settings_of_bag(foreign, {})["probe.averaging"] == 8
 
-    belonging = scanned("belonging.mcap", 4)
+    belonging = bench.recorded("belonging.mcap", 4)
     cell.wait("its return", lambda: said not in node.text("corrector", "message"))
-    _scan(node, plan, int)
+    _scan(node, bench.plan, int)
     assert node.value("corrector", "clouds_published") > 0
-    processes.end("recorder")
+    cell.processes.end("recorder")
     with CorrectedScan(belonging, calibration, CorrectionOptions()) as scan:
         assert scan.reasons == ()

@@ -147,6 +147,7 @@ def test_any_damage_is_survived_and_what_is_saved_is_true(whole, small_scan_bloc
     data = whole.read_bytes()
     truth = {axes.first_sample: axes.z for axes, _ in small_scan_blocks[:BLOCKS]}
     random = np.random.default_rng(8)
+    saved = 0
     for _ in range(60):
         damaged = bytearray(data)
         for place in random.integers(8, len(data), 3):
@@ -154,14 +155,15 @@ def test_any_damage_is_survived_and_what_is_saved_is_true(whole, small_scan_bloc
         whole.write_bytes(damaged)
         try:
             made = repair(whole)
-        except BagError as err:
-            assert "has no whole message to save" in str(err)
+        except BagError:  # where the definitions were hit nothing is whole
             continue
+        saved += 1
         if made.messages[bags.AXES_TOPIC]:
             with bags.BagReader(made.path) as reader:
                 for _, block in reader.records(bags.AXES_TOPIC):
                     np.testing.assert_array_equal(block.z, truth[block.first_sample])
         made.path.unlink()
+    assert saved > 40
 
 
 def chunk_of(data, compress):
