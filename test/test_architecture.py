@@ -261,6 +261,7 @@ def test_a_file_is_read_in_one_sitting(path):
 def test_a_test_is_read_in_one_sitting(path):
     lines = len(path.read_text(encoding="utf-8").splitlines())
     assert lines <= GREATEST_FILE, "split it by subject; what several share goes beside them"
+    assert not list(functions_fit_a_screen(path.stem, _tree(path)))
 
 
 # A rule broken is a rule told.

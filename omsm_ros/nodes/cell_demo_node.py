@@ -73,19 +73,16 @@ class DemoNode(Node):
         self, what: str, done: Callable[[], bool], watch: Callable[[], object] = lambda: None
     ) -> None:
         """Spin until ``done``; DeviceTimeoutError if ``watch`` stands still for long."""
-        last, deadline = watch(), self._deadline()
+        last, deadline = watch(), time.monotonic() + _STALL_TIMEOUT_S
         while not done():
             rclpy.spin_once(self, timeout_sec=0.1)
             self._processes.check()
             if (now := watch()) != last:
-                last, deadline = now, self._deadline()
-            if self.get_clock().now().nanoseconds > deadline:
+                last, deadline = now, time.monotonic() + _STALL_TIMEOUT_S
+            if time.monotonic() > deadline:
                 raise DeviceTimeoutError(
                     f"waited in vain for {what}; see the logs beside the results"
                 )
-
-    def _deadline(self) -> float:
-        return self.get_clock().now().nanoseconds + _STALL_TIMEOUT_S * 1e9
 
     def ask(self, kind: Any, name: str, request: Any, patience: float = _SERVICE_TIMEOUT_S) -> Any:
         """Call a service and return its answer; DeviceTimeoutError if there is none."""
