@@ -38,6 +38,8 @@ class Bench:
         parameters = self.plan.driver_parameters()
         self.processes.start("confocal_driver", **parameters, averaging=averaging)
         listeners = 2 + ("recorder" in self.processes._running)
+        # What is known of it is of the one before until it tells that it has sent nothing yet.
+        self.cell.wait("a new one", lambda: self.node.value("confocal_driver", "blocks") == 0)
         self._until("it", "confocal_driver", "axes_subscribers", listeners)
         self._until("the device", "confocal_driver", "connections", 1)
 
