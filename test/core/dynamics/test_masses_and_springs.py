@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.dynamics.masses_and_springs import (
+    FITTED,
     TwoMass,
     finite_values,
     fit_two_mass,
     oscillations,
     shape,
 )
+from omsm_ros.core.dynamics.response_band import relative_response_jacobian
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.errors import DataError, IdentificationError
 from omsm_ros.twin.plant import PAPER_EQ_12
@@ -77,6 +79,49 @@ def test_masses_and_springs_are_recovered(collocated):
     for name in ("m2", "k1", "k2", "c1", "c2"):
         assert getattr(fitted.model, name) == pytest.approx(getattr(MACHINE, name), rel=1e-3)
     assert np.all(np.isfinite(fitted.uncertainty))
+
+
+@pytest.mark.parametrize("collocated", [False, True])
+def test_masses_and_springs_lie_within_what_is_stated_of_them(collocated):
+    """Responses drawn from their covariance, with coefficients that the machine does not need."""
+    soft = TwoMass(m1=1.0, m2=0.2, k1=2e5, k2=4e4, c1=45.0, c2=6.0)
+    truth = soft.collocated() if collocated else soft.non_collocated()
+    numerator = np.zeros(4)
+    numerator[: len(truth.numerator)] = truth.numerator
+    lines = np.linspace(2, 80, 40)
+    padded = TransferFunction(numerator, truth.denominator)
+    jacobian = np.vstack(relative_response_jacobian(padded, lines))
+    # The numerator but for G(0) = 1, the denominator but for its 1. A step test knows what is slow
+    # much better than what is fast.
+    known = np.tile(1e-7 * (1 + (lines / 4) ** 2), 2)[:, np.newaxis]
+    free = range(1, jacobian.shape[1] - 1)
+    size = np.linalg.norm(jacobian[:, free] / known, axis=0)
+    scaled = jacobian[:, free] / known / size
+    covariance = np.zeros((jacobian.shape[1],) * 2)
+    covariance[np.ix_(free, free)] = (
+        (2e-5) ** 2 * np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
+    )
+    root = np.linalg.cholesky(covariance[np.ix_(free, free)] * np.outer(size, size))
+    random = np.random.default_rng(5)
+    exact = np.log([soft.m2, soft.k1, soft.k2, soft.c1, soft.c2])
+    errors, misfits = [], []
+    for _ in range(30):
+        drawn = np.concatenate([numerator, truth.denominator[1:]])
+        drawn[1:] += root @ random.normal(size=len(free)) / size
+        fitted = fit_two_mass(
+            TransferFunction(drawn[:4], np.r_[1.0, drawn[4:]]),
+            covariance,
+            table_mass=1.0,
+            collocated=collocated,
+            frequencies=lines,
+        )
+        found = np.log([getattr(fitted.model, name) for name in FITTED])
+        errors.append((found - exact) / fitted.uncertainty)
+        misfits.append(fitted.misfit)
+    assert max(misfits) < 3
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0))
+    # An rms of 30 draws scatters by 13 %.
+    assert np.all((ratio > 0.6) & (ratio < 1.4)), ratio
 
 
 def test_one_mode_cannot_be_two_masses():
