@@ -6,6 +6,9 @@ loop, so another one goes first.
 
 from __future__ import annotations
 
+import math
+import resource
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,19 +17,25 @@ from typing import Any
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS, shown
 
-# To start a process, and to read from a slow disk; a damaged file of any size is known so soon.
-LIMIT_S, SLOWEST_BYTES_S = 3.0, 50e6
+# Of a processor: to load the library, and to unpack slowly. A loop takes that much on an idle
+# computer as on a busy one; what only waits, for a disk, has ten times as long.
+LIMIT_S, SLOWEST_BYTES_S, _WAITING = 2.0, 50e6, 10.0
 _ELSEWHERE = 3
 
 
 def walked(path: Path, what: str) -> None:
     """Raise FileError if reading all of ``path`` does not end, ends its process, or leaves it."""
-    command = [sys.executable, "-m", __name__, str(path.absolute())]
-    limit = LIMIT_S + path.stat().st_size / SLOWEST_BYTES_S
+    limit = math.ceil(LIMIT_S + path.stat().st_size / SLOWEST_BYTES_S)
+    command = [sys.executable, "-m", __name__, str(path.absolute()), str(limit)]
+    endless = f"{what} is not read in {limit} s: damaged; write it again"
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=limit, text=True)
+        done = subprocess.run(
+            command, capture_output=True, check=False, timeout=_WAITING * limit, text=True
+        )
     except subprocess.TimeoutExpired as err:
-        raise FileError(f"{what} is not read in {limit:.1f} s: damaged; write it again") from err
+        raise FileError(endless) from err
+    if done.returncode == -signal.SIGXCPU:
+        raise FileError(endless)
     if done.returncode == _ELSEWHERE:
         raise FileError(
             f"{what} takes {done.stdout.strip()} from another file; save it with all its data"
@@ -35,8 +44,9 @@ def walked(path: Path, what: str) -> None:
         raise FileError(f"{what} ends the program that reads it: damaged; write it again")
 
 
-def _walk(path: str) -> None:
-    """Read every attribute, and every array that could be a map."""
+def _walk(path: str, limit: int) -> None:
+    """Read all attributes, and all arrays that could be a map; ``limit`` of processor time [s]."""
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
     import h5py
 
     def look(name: str, item: Any) -> None:
@@ -70,4 +80,4 @@ def _keep_within(h5py: Any, name: str, item: Any) -> None:
 
 
 if __name__ == "__main__":
-    _walk(sys.argv[1])
+    _walk(sys.argv[1], int(sys.argv[2]))

@@ -1,5 +1,6 @@
 """A damaged HDF5 file neither holds nor ends the program that reads it."""
 
+import os
 import subprocess
 from types import SimpleNamespace
 
@@ -32,8 +33,23 @@ def test_what_the_library_refuses_is_left_to_its_reader(tmp_path):
 
 
 def test_one_that_does_not_end_is_told(file, monkeypatch):
-    monkeypatch.setattr(hdf5_walk, "LIMIT_S", 1e-3)
-    with pytest.raises(FileError, match="it is not read in"):
+    """The library in a loop: another of its name, which takes the processor for ever."""
+    (file.parent / "h5py.py").write_text("while True:\n    pass\n")
+    monkeypatch.setenv("PYTHONPATH", str(file.parent), prepend=os.pathsep)
+    monkeypatch.setattr(hdf5_walk, "LIMIT_S", 0.5)
+    begun = os.times()
+    with pytest.raises(FileError, match="it is not read in 1 s"):
+        walked(file, "it")
+    now = os.times()
+    took = (now.children_user + now.children_system) - (begun.children_user + begun.children_system)
+    assert 0.9 < took < 2.5
+
+
+def test_one_that_waits_for_ever_is_told(file, monkeypatch):
+    (file.parent / "h5py.py").write_text("import time\ntime.sleep(1000)\n")
+    monkeypatch.setenv("PYTHONPATH", str(file.parent), prepend=os.pathsep)
+    monkeypatch.setattr(hdf5_walk, "_WAITING", 0.5)
+    with pytest.raises(FileError, match="it is not read in 3 s"):
         walked(file, "it")
 
 
