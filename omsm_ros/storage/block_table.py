@@ -96,12 +96,13 @@ def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
     follows = (first[1:] == first[:-1] + samples) & (period[1:] == period[:-1])
     follows &= stamp[1:] >= stamp[:-1]
     edges = np.flatnonzero(~follows) + 1
+    parts = np.stack([first.astype(np.int64), stamp], axis=1)
     for start, stop in zip([0, *edges], [*edges, len(table)], strict=True):
         rows = table[start:stop]
         yield kind(
             stamp_ns=int(stamp[start]),
             first_sample=int(first[start]),
             sample_period=float(period[start]),
-            parts=tuple(zip(first[start:stop].tolist(), stamp[start:stop].tolist(), strict=True)),
+            parts=parts[start:stop],
             **{name: np.array(rows[name], channel).ravel() for name, channel in present},
         )

@@ -54,6 +54,11 @@ class Status(IntEnum):
     LOST = 4
 
 
+def no_parts() -> IntArray:
+    """Return the parts of a block of one message, (0, 2)."""
+    return np.empty((0, 2), np.int64)
+
+
 def _empty_f32() -> NDArray[np.float32]:
     return np.empty(0, np.float32)
 
@@ -69,13 +74,13 @@ class Block:
     stamp_ns: time of the first sample [ns, ROS time]
     first_sample: trigger counter of the first sample
     sample_period: [s]
-    parts: first sample and stamp of each message that it was joined of; empty if of one
+    parts: first sample and stamp [ns] of each message it was joined of, (k, 2); empty if of one
     """
 
     stamp_ns: int
     first_sample: int
     sample_period: float
-    parts: tuple[tuple[int, int], ...] = ()
+    parts: IntArray = field(default_factory=no_parts)
 
     def __len__(self) -> int:
         """Samples in the block."""

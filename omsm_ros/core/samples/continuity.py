@@ -8,11 +8,15 @@ times the sample period, when a recording is played in time lapse.
 
 from __future__ import annotations
 
+from array import array
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from omsm_ros.core.samples.blocks import Block
+import numpy as np
+
+from omsm_ros.core.samples.blocks import Block, BoolArray, FloatArray, IntArray
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Messages are not delivered this late; time that falls back further has been set back.
@@ -106,57 +110,75 @@ class StampLine:
     """Stamps of one stream's blocks, in the order of sessions and counts."""
 
     def __init__(self) -> None:
-        self._coming: deque[tuple[int, int, int]] = deque()
+        # A row each, those before ``_head`` are done with: a bag brings thousands at once.
+        self._sessions, self._counts, self._stamps = array("q"), array("q"), array("q")
+        self._head = 0
         self._current: tuple[int, int, int] | None = None
 
     def add(self, session: int, count: int, stamp_ns: int) -> None:
         """Append the newest block's session, first count and stamp."""
-        self._coming.append((session, count, stamp_ns))
+        self._clear()
+        self._sessions.append(session)
+        self._counts.append(count)
+        self._stamps.append(stamp_ns)
 
-    def extend(self, session: int, offset: int, stamps: Iterable[tuple[int, int]]) -> None:
-        """Append first counts, less ``offset``, and stamps of the newest blocks of a session."""
-        self._coming.extend((session, first + offset, stamp) for first, stamp in stamps)
+    def extend(self, session: int, counts: IntArray, stamps: IntArray) -> None:
+        """Append first counts and stamps of the newest blocks of a session, each (n,)."""
+        self._clear()
+        self._sessions.extend(array("q", [session]) * len(counts))
+        self._counts.frombytes(np.ascontiguousarray(counts, np.int64).tobytes())
+        self._stamps.frombytes(np.ascontiguousarray(stamps, np.int64).tobytes())
+
+    def _clear(self) -> None:
+        for column in (self._sessions, self._counts, self._stamps):
+            del column[: self._head]
+        self._head = 0
+
+    def __len__(self) -> int:
+        """Blocks to come."""
+        return len(self._counts) - self._head
 
     def advance(self, session: int, count: int) -> bool:
         """Go to the block of ``count``; return whether it begins there."""
-        while self._coming and self._coming[0][:2] <= (session, count):
-            self._current = self._coming.popleft()
-            if self._current[:2] == (session, count):
-                return True
-        return False
+        before = self._head
+        while self._head < len(self._counts) and self._next() <= (session, count):
+            self._head += 1
+        if self._head == before:
+            return False
+        self._current = self._row(self._head - 1)
+        return self._current[:2] == (session, count)
 
-    def in_step(
-        self, other: StampLine, sessions: tuple[int, int], end: int, tolerance_ns: float
-    ) -> list[tuple[int, int, int]]:
-        """Go to the last of the next blocks below ``end`` that two lines have in common.
+    def skip(self, blocks: int) -> None:
+        """Go on by so many blocks."""
+        if blocks:
+            self._head += blocks
+            self._current = self._row(self._head - 1)
 
-        Return the first count of each, its stamp here, and how much earlier the other's is [ns].
+    def coming(self, session: int, end: int) -> tuple[IntArray, IntArray] | None:
+        """Return first counts below ``end`` and stamps of a session's next blocks, each (1 + n,).
+
+        The block that has begun leads; None where the session has none.
         """
-        mine, others = self._coming, other._coming
-        one, two = sessions
-        taken: list[tuple[int, int, int]] = []
-        while mine and others:
-            session, count, stamp = mine[0]
-            their_session, their_count, their_stamp = others[0]
-            if not (their_count == count < end and session == one and their_session == two):
-                break
-            if abs(stamp - their_stamp) > tolerance_ns:
-                break
-            self._current, other._current = mine.popleft(), others.popleft()
-            taken.append((count, stamp, stamp - their_stamp))
-        return taken
+        if self._current is None or self._current[0] != session:
+            return None
+        until = bisect_right(self._sessions, session, self._head)
+        place = slice(self._head, bisect_left(self._counts, end, self._head, until))
+        _, count, stamp = self._current
+        counts, stamps = self._counts[place], self._stamps[place]
+        return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
 
     def leaps(self, session: int, count: int, period_ns: float) -> bool:
         """Return whether the block that begins at ``count``, if one does, comes after a pause."""
-        expected = self.stamp_of(session, count, period_ns)
-        if expected is None or not self._coming or self._coming[0][:2] != (session, count):
+        if self._current is None or not len(self) or self._next() != (session, count):
             return False
-        return self._coming[0][2] - expected >= _PAUSE_NS
+        begun, before, stamp = self._current
+        ahead = self._stamps[self._head] - stamp - (count - before) * period_ns
+        return begun == session and ahead >= _PAUSE_NS
 
     def next_in(self, session: int, end: int) -> int:
         """Return where the next block begins, ``end`` if not before it."""
-        if self._coming and self._coming[0][0] == session:
-            return min(self._coming[0][1], end)
+        if len(self) and self._sessions[self._head] == session:
+            return min(self._counts[self._head], end)
         return end
 
     def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
@@ -164,3 +186,107 @@ class StampLine:
         if self._current is None or self._current[0] != session:
             return None
         return self._current[2] + (count - self._current[1]) * period_ns
+
+    def later_than(
+        self, other: StampLine, sessions: tuple[int, int], period_ns: float
+    ) -> float | None:
+        """Return by how much later a count is stamped here than there [ns], None where unknown.
+
+        Of the blocks that have begun, whose counts both have; exact, as stamps of today are not in
+        floating point.
+        """
+        here, there = self._current, other._current
+        if here is None or there is None or (here[0], there[0]) != sessions:
+            return None
+        return here[2] - there[2] + (there[1] - here[1]) * period_ns
+
+    def _next(self) -> tuple[int, int]:
+        return self._sessions[self._head], self._counts[self._head]
+
+    def _row(self, at: int) -> tuple[int, int, int]:
+        return self._sessions[at], self._counts[at], self._stamps[at]
+
+
+def stamps_ahead(
+    lines: Sequence[StampLine], sessions: tuple[int, int], end: int, period_ns: float
+) -> tuple[FloatArray, BoolArray] | None:
+    """Return what the next blocks of two streams say where one begins, as :class:`StampHistory` has
+    it, (n, 5), and whether one comes after a pause, (n,); None where a stream has no stamp yet.
+
+    Counts below ``end``. The same as :class:`StampLine` tells one by one, to the last bit.
+    """
+    one, other = (line.coming(s, end) for line, s in zip(lines, sessions, strict=True))
+    if one is None or other is None:
+        return None
+    counts = np.union1d(one[0][1:], other[0][1:])
+    (first, stamp, leap), (other_first, other_stamp, other_leap) = (
+        _at(counts, *blocks, period_ns) for blocks in (one, other)
+    )
+    skew = stamp - other_stamp + (other_first - first) * period_ns
+    time = stamp + (counts - first) * period_ns
+    columns = [counts, skew, first == counts, other_first == counts, time]
+    return np.stack(columns, axis=1, dtype=np.float64), leap | other_leap
+
+
+def _at(
+    counts: IntArray, firsts: IntArray, stamps: IntArray, period_ns: float
+) -> tuple[IntArray, IntArray, BoolArray]:
+    """Return first count and stamp of the blocks that hold ``counts`` (n,), and which leap."""
+    ahead = np.diff(stamps) - np.diff(firsts) * period_ns
+    leap = np.concatenate([[False], ahead >= _PAUSE_NS])
+    block = np.searchsorted(firsts, counts, "right") - 1
+    return firsts[block], stamps[block], (firsts[block] == counts) & leap[block]
+
+
+# Stamps that advance faster or slower than the counts by this factor are of a time lapse, or none:
+# a second of theirs is not one of the samples. A slip of a third of the span is still judged.
+_TIME_LAPSE = 1.5
+
+
+class StampHistory:
+    """What the stamps of two streams said at the last counts at which a block began.
+
+    rows: count, by how much later the first stream is stamped [ns], whether a block of the first
+        and whether one of the second begins there, time of the first [ns]; (n, 5), most at most
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._room, self._held = np.empty((2 * most, 5)), 0
+
+    @property
+    def rows(self) -> FloatArray:
+        """Those held, in their order."""
+        return self._room[max(self._held - self._most, 0) : self._held]
+
+    def add(self, rows: FloatArray) -> None:
+        """Append rows, (n, 5)."""
+        rows = rows[-self._most :]
+        if self._held + len(rows) > len(self._room):
+            kept = self.rows.copy()
+            self._held = len(kept)
+            self._room[: self._held] = kept
+        self._room[self._held : self._held + len(rows)] = rows
+        self._held += len(rows)
+
+    def after(self, count: float) -> FloatArray:
+        """Return the rows beyond a count."""
+        return self.rows[np.searchsorted(self.rows[:, 0], count, "right") :]
+
+    def recent(self, first: float, since: float, least: int) -> FloatArray | None:
+        """Return the rows from the count ``since``, or so many that ``least`` are of each stream.
+
+        first: none before this count;  None if that leaves too few
+        """
+        rows = self.rows[np.searchsorted(self.rows[:, 0], first) :]
+        starts = [np.flatnonzero(rows[:, column]) for column in (2, 3)]
+        if min(map(len, starts)) < least:
+            return None
+        begin = int(np.searchsorted(rows[:, 0], since))
+        return rows[min(begin, *(int(s[-least]) for s in starts)) :]
+
+    def in_real_time(self, period_ns: float) -> bool:
+        """Return whether stamps advance about as the counts do."""
+        (first, *_, began), (last, *_, ended) = self.rows[0], self.rows[-1]
+        elapsed, passed = (last - first) * period_ns, ended - began
+        return bool(elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed)

@@ -8,7 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
+from omsm_ros.core.samples.blocks import (
+    AxisBlock,
+    DistanceBlock,
+    FloatArray,
+    IntArray,
+    Status,
+    no_parts,
+)
 from omsm_ros.errors import DataError
 from omsm_ros.foreign_units import (
     DATE,
@@ -266,7 +273,7 @@ def axis_blocks(
             stamp_ns=stamp_ns,
             first_sample=first,
             sample_period=rows.period,
-            parts=(),
+            parts=no_parts(),
             **{c: values[part] for c, values in channels.items()},
         )
 

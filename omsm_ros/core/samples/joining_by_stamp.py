@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray, no_parts
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.merging import uninterrupted
 from omsm_ros.errors import ConfigurationError, DataError
@@ -163,7 +163,7 @@ def _at(
         stamp_ns=block.stamp_ns,
         first_sample=block.first_sample,
         sample_period=block.sample_period,
-        parts=(),
+        parts=no_parts(),
         **channels,
     )
 

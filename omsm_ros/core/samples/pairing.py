@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,17 +111,20 @@ class Intake:
 
     def _note(self, block: Block, arrival: Arrival) -> None:
         """Keep the stamps of what is new of ``block``."""
-        period_ns, begins = _period_ns(block), arrival.first + arrival.skip
-        stamps = block.parts or ((block.first_sample, block.stamp_ns),)
-        if begins == stamps[0][0] + self._offset:  # as nearly always: all of it is new
-            self.stamps.extend(arrival.session, self._offset, stamps)
+        begins, period_ns = arrival.first + arrival.skip, _period_ns(block)
+        if not len(block.parts):
+            first = block.first_sample + self._offset
+            late = max(begins - first, 0)
+            if late < len(block):
+                stamp_ns = block.stamp_ns + round(late * period_ns)
+                self.stamps.add(arrival.session, first + late, stamp_ns)
             return
-        ends = [*(first for first, _ in stamps[1:]), block.end]
-        for (first_sample, stamp_ns), end in zip(stamps, ends, strict=True):
-            skip = max(begins - first_sample - self._offset, 0)
-            if skip < end - first_sample:
-                new = first_sample + self._offset + skip
-                self.stamps.add(arrival.session, new, stamp_ns + round(skip * period_ns))
+        firsts, stamps = block.parts.T
+        firsts = firsts + self._offset
+        new = np.append(firsts[1:], block.end + self._offset) > begins
+        skipped = np.maximum(begins - firsts[new], 0)
+        stamps = stamps[new] + np.rint(skipped * period_ns).astype(np.int64)
+        self.stamps.extend(arrival.session, firsts[new] + skipped, stamps)
 
     def end(self) -> None:
         """Begin a session with whatever comes next."""
@@ -245,8 +250,10 @@ class Pairing:
         if sessions != self.watch.sessions:
             yield from self.end()
         self._held.append((self.axes.hold(samples), self.distance.hold(samples)))
-        for until, slipped in self.watch.settled(sessions, first, first + samples, a.period_ns):
-            yield from self._settle(until, slipped)
+        verdicts = self.watch.settled(sessions, first, first + samples, a.period_ns)
+        # Pairs with one verdict are one run, however many stamps it rests on.
+        for slipped, alike in groupby(verdicts, key=itemgetter(1)):
+            yield from self._settle(max(until for until, _ in alike), slipped)
 
     def _settle(self, until: int, slipped: bool) -> Iterator[tuple[Run, Run]]:
         """Yield the pairs that waited before the count ``until``, but for those that slipped."""

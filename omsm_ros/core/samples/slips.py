@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.samples.continuity import StampLine
+from omsm_ros.core.samples.continuity import StampHistory, StampLine, stamps_ahead
 from omsm_ros.core.samples.scatter import median, spread_about_median
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
@@ -51,9 +51,6 @@ _SEVERAL_TIMES = 3.0
 # A driver's clock is the end of a line, which moves more than a mean does. In 20 to 30 starts with
 # arrivals uneven by ±20 ms: 0.5 gives 2 false alarms, 0.7 none; 1.0 finds small slips late.
 _END_OF_LINE = 0.7
-# Stamps that advance faster or slower than the counts by this factor are of a time lapse, or none:
-# a second of theirs is not one of the samples. A slip of a third of the span is still judged.
-_TIME_LAPSE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +73,8 @@ class CommonTrigger:
 
 # One driver's stamps of one trigger, rounded twice, differ by no more than this [ns].
 _SAME_NS = 2.0
+# Stamps that are worth taking together.
+_MANY = 16
 # Pairs wait no longer than this for the first verdict: blocks are too long for one [s].
 _MOST_WAIT_S = 10.0
 
@@ -127,8 +126,7 @@ class SlipWatch:
         self._judged_to, self._odd_at = first, -math.inf
         # Whether any stamp since the last verdict is off enough: without one no median is.
         self._odd = False
-        # Of each stamp: count, skew [ns], whether it is of the axes, of the distance, axes' time.
-        self._seen: deque[tuple[int, float, bool, bool, float]] = deque(maxlen=_MOST_STAMPS)
+        self._seen = StampHistory(_MOST_STAMPS)
         # Skew at each stride of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
@@ -157,7 +155,8 @@ class SlipWatch:
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
-            if self._in_step(end, period_ns):
+            if (last := self._quiet(end, period_ns)) is not None:
+                yield self._agreed(last, period_ns), False
                 continue
             pairs = zip(self._lines, sessions, strict=True)
             if self._common or any(line.leaps(s, count, period_ns) for line, s in pairs):
@@ -174,35 +173,51 @@ class SlipWatch:
         if self._common or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
 
-    def _in_step(self, end: int, period_ns: float) -> bool:
-        """Take the next stamps that one driver gave both streams; return whether there were any.
+    def _quiet(self, end: int, period_ns: float) -> int | None:
+        """Take the next stamps up to the first that stands out, as :meth:`_observe` takes each.
 
-        Nothing can have slipped there. Of a bag they are all there at once, and cost little.
+        Return the last one's count; None if that one has to be looked at by itself. Of a bag
+        thousands are there at once, and of one driver or two nearly none stands out.
         """
-        if not self._common or self._starting or self._odd or self._state.samples:
-            return False
-        axes, distance = self._lines
-        taken = axes.in_step(distance, self.sessions, end, _SAME_NS)
-        if not taken:
-            return False
-        per_s = NANOSECONDS_PER_S / period_ns
-        stride = max(_STRIDE_S * per_s, 1.0)
-        for count, _, skew in taken:
-            if (judged := int(count // stride)) != self._judged:
-                self._judged, self._since = judged, count - _SPAN_S * per_s
-                self._wander.append(skew)
-        self._stamps = [stamps + len(taken) for stamps in self._stamps]
-        self._shown = [taken[-1][0]] * 2
-        self._seen.extend((n, skew, True, True, at) for n, at, skew in taken[-_MOST_STAMPS:])
-        return True
+        if self._starting or self._odd or self._state.samples or sum(map(len, self._lines)) < _MANY:
+            return None
+        ahead = stamps_ahead(self._lines, self.sessions, end, period_ns)
+        if ahead is None:
+            return None
+        self._period_ns = period_ns
+        rows, leaps = ahead
+        size = abs(rows[:, 1])
+        apart = leaps | (size >= self._off_ns()) | (self._common & (size > _SAME_NS))
+        rows = rows[: int(np.argmax(apart)) if apart.any() else None]
+        if not len(rows):
+            return None
+        strides = rows[:, 0] // self._stride(period_ns)
+        begins = np.flatnonzero(np.diff(strides, prepend=self._judged))
+        if len(begins):
+            self._judged = int(strides[-1])
+            self._since = rows[begins[-1], 0] - _SPAN_S * NANOSECONDS_PER_S / period_ns
+            self._wander.extend(rows[begins, 1].tolist())
+        self._seen.add(rows)
+        for stream, line in enumerate(self._lines):
+            begun = np.flatnonzero(rows[:, 2 + stream])
+            if len(begun):
+                line.skip(len(begun))
+                self._stamps[stream] += len(begun)
+                self._shown[stream] = int(rows[begun[-1], 0])
+        return int(rows[-1, 0])
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as it can be told."""
         since = self._start - 1 if self._starting else min(self._shown)
         few = self._starting and min(self._stamps) < _LEAST_STAMPS
-        if self._state.samples or self._odd_at <= since or few or not self._in_real_time():
+        if (
+            self._state.samples
+            or self._odd_at <= since
+            or few
+            or not self._seen.in_real_time(self._period_ns)
+        ):
             return bool(self._state.samples)
-        rows = np.array([seen for seen in self._seen if seen[0] > since])
+        rows = self._seen.after(since)
         found = self._verdict(rows[:, 1] / self._period_ns)
         if found.samples and len(rows) >= _SURE_STAMPS:
             self._state = self.found = found
@@ -225,14 +240,13 @@ class SlipWatch:
         """Take the skew where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
         begun = axes.advance(a, count), distance.advance(d, count)
-        late, early = axes.stamp_of(a, count, period_ns), distance.stamp_of(d, count, period_ns)
-        if late is None or early is None:
+        skew = axes.later_than(distance, self.sessions, period_ns)
+        if skew is None:
             self._common = False
             return
-        skew, per_s = late - early, NANOSECONDS_PER_S / period_ns
-        self._period_ns = period_ns
+        self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
         self._note(count, skew, begun)
-        stride = int(count // max(_STRIDE_S * per_s, 1.0))
+        stride = int(count // self._stride(period_ns))
         judged, self._judged = self._judged, stride
         early_days = count - self._start < _FIRST_S * per_s
         if stride != judged:
@@ -241,7 +255,8 @@ class SlipWatch:
                 self._judge(count)
             if not self._state.samples:
                 self._wander.append(skew)
-        self._seen.append((count, skew, *begun, late))
+        time = axes.stamp_of(a, count, period_ns) or 0.0
+        self._seen.add(np.array([[count, skew, *begun, time]]))
         self._odd |= self._is_off(skew) and not early_days
 
     def _note(self, count: int, skew: float, begun: tuple[bool, bool]) -> None:
@@ -255,14 +270,23 @@ class SlipWatch:
         if self._is_off(skew):
             self._odd_at = count
 
+    def _off_ns(self) -> float:
+        """Return the skew that is off [ns]."""
+        return self._steady(self._period_ns) * self._period_ns
+
     def _is_off(self, skew: float) -> bool:
-        return abs(skew) >= self._steady(self._period_ns) * self._period_ns
+        return abs(skew) >= self._off_ns()
+
+    @staticmethod
+    def _stride(period_ns: float) -> float:
+        """Return the samples from one verdict to the next."""
+        return max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0)
 
     def _judge(self, count: int) -> None:
         if not (self._odd or self._state.samples or self._starting):
             return
         rows = self._recent()
-        if rows is None or not self._in_real_time():
+        if rows is None or not self._seen.in_real_time(self._period_ns):
             self._state, self._odd = Slip(), True
             if rows is not None:
                 self._starting, self._judged_to = False, count  # stamps tell nothing
@@ -274,26 +298,18 @@ class SlipWatch:
             self.found = self._state if self._state.samples else self.found
 
     def _recent(self) -> FloatArray | None:
-        """Return the stamps to be judged, as in ``_seen`` (n, 5); None if they are too few."""
-        seen = np.array(self._seen, np.float64).reshape(-1, 5)
+        """Return the stamps to be judged, as :class:`StampHistory` has them; None if too few."""
         first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
-        seen = seen[np.searchsorted(seen[:, 0], first) :]
-        starts = [np.flatnonzero(seen[:, column]) for column in (2, 3)]
-        if min(map(len, starts)) < _LEAST_STAMPS:
-            return None
-        since = int(np.searchsorted(seen[:, 0], self._since))
-        return seen[min(since, *(int(s[-_LEAST_STAMPS]) for s in starts)) :]
-
-    def _in_real_time(self) -> bool:
-        """Return whether stamps [ns] advance about as the counts do."""
-        (first, *_, began), (last, *_, ended) = self._seen[0], self._seen[-1]
-        elapsed, passed = (last - first) * self._period_ns, ended - began
-        return elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed
+        return self._seen.recent(first, self._since, _LEAST_STAMPS)
 
     def _window(self) -> FloatArray | None:
         """Return the skews to be judged [samples], None if they say nothing."""
         rows = self._recent()
-        return None if rows is None or not self._in_real_time() else rows[:, 1] / self._period_ns
+        return (
+            None
+            if rows is None or not self._seen.in_real_time(self._period_ns)
+            else rows[:, 1] / self._period_ns
+        )
 
     def _steady(self, period_ns: float) -> float:
         """Return the skew of stamps without scatter that is a slip [samples]."""

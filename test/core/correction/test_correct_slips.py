@@ -89,7 +89,7 @@ def as_a_bag_gives_them(blocks: list[Block]) -> list[Block]:
     """Blocks that follow on as one, which keeps the stamps of all; as of messages read at once."""
     made: list[Block] = []
     for run in uninterrupted(blocks):
-        parts = tuple((block.first_sample, block.stamp_ns) for block in run)
+        parts = np.array([(block.first_sample, block.stamp_ns) for block in run])
         made.append(replace(joined(run), parts=parts))  # type: ignore[type-var]
     return made
 
