@@ -238,3 +238,22 @@ def test_identify_puts_counters_together_by_the_offset(capsys, tmp_path, step_te
     said = capsys.readouterr()
     assert alone == 2
     assert "slipped" in said.err or "rejected" in said.err
+
+
+def test_a_motion_is_averaged_over_the_exposure(corrected, folder, small_scan_blocks):
+    """Z swings at 20 Hz: of it sin(π f T)/(π f T) is left, and the path filter follows to 1 %."""
+    frequency, amplitude, exposure = 20.0, 1e-6, 5e-3
+
+    def swinging(block):
+        time = block.sample_period * (block.first_sample + np.arange(len(block.z)))
+        return replace(block, z=block.z + amplitude * np.sin(2 * np.pi * frequency * time))
+
+    bag_of(folder / "swinging.mcap", small_scan_blocks[:50], of_axes=swinging)
+    clouds = [
+        corrected("--by-stamps", *more, bag="swinging.mcap")[1]
+        for more in ((), ("--exposure", exposure))
+    ]
+    _, here, there = np.intersect1d(*(c["sample"] for c in clouds), return_indices=True)
+    change = (clouds[1]["height"][there] - clouds[0]["height"][here])[200:-200]
+    lost = amplitude * (1 - np.sinc(frequency * exposure))
+    assert np.std(change) * np.sqrt(2) == pytest.approx(lost, rel=0.05)

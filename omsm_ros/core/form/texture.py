@@ -96,12 +96,15 @@ def _slope_figures(cells: Cells, bands: Bands) -> dict[str, Figure]:
 
 
 def _band(cells: Cells, long: float | None, short: float, whole: bool = False) -> _Filtered:
-    """Return what has wavelengths from ``short`` to ``long``: present cells, or whole images."""
+    """Return what has wavelengths from ``short`` to ``long``: present cells, or whole images.
+
+    The L-filter takes its share of what the S-filter left (ISO 25178-2), not of the cells.
+    """
     more = np.random.default_rng(_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
     images = np.concatenate([[cells.mean, more], cells.effects])
     fine = cells.smoothed(images, short)
     if long is not None:
-        fine = fine - cells.smoothed(images, long)
+        fine = fine - cells.smoothed(fine, long)
     rows = fine if whole else fine[:, cells.present]
     return _Filtered(rows[0], rows[0] + rows[1], rows[2:])
 
