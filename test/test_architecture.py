@@ -62,7 +62,7 @@ ONLY_IN = {
     "tf2_msgs": {"nodes"},
     "geometry_msgs": {"nodes"},
     "serial": {"devices.transport"},
-    "socket": {"devices.transport", "emulators.tcp_server"},
+    "socket": {"devices.transport", "emulators.tcp_server", "viewing.few_connections"},
     "rosbags": {"storage"},
     "mcap": {"storage.recording"},
     "websockets": {"viewing"},

@@ -100,7 +100,10 @@ class ViewerNode(ManagedNode):
             if status.name.startswith(where):
                 level = _LEVELS.get(status.level, "ERROR")
                 values = {entry.key: entry.value for entry in status.values[:200]}
-                self._view.add_state(status.name, level, status.message, values)
+                try:
+                    self._view.add_state(status.name, level, status.message, values)
+                except OmsmError as err:
+                    self._complain(str(err))
 
 
 def main() -> None:

@@ -32,6 +32,11 @@ _SET = "calibration_set"
 
 _AXES = ("x", "y", "z", "b", "c")
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
+# Of each field of a point: name, offset [bytes], type, count.
+_POINT_LAYOUT = [
+    (name, (POINT_DTYPE.fields or {})[name][1], _POINT_FIELD_TYPES[kind], 1)
+    for name, kind in CLOUD_FIELDS
+]
 
 
 @dataclass(frozen=True)
@@ -161,6 +166,19 @@ def cloud_array(message: Any) -> NDArray[np.void]:
             f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}; give "
             "one that the corrector published"
         )
+    layout = [(field.name, field.offset, field.datatype, field.count) for field in message.fields]
+    if layout != _POINT_LAYOUT:
+        names = ", ".join(name for name, *_ in _POINT_LAYOUT)
+        raise DataError(
+            f"cloud of {len(layout)} fields, expected {names}, each in its place and of its type; "
+            "give one that the corrector published"
+        )
+    size = message.width * message.height * message.point_step
+    if len(message.data) != size:
+        raise DataError(
+            f"cloud of {message.width} by {message.height} points with {len(message.data)} bytes, "
+            f"expected {size}; give one that the corrector published"
+        )
     return np.frombuffer(memoryview(message.data), POINT_DTYPE)
 
 
@@ -233,16 +251,9 @@ def cloud_message(
     messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
 ) -> Any:
     """Return ``sensor_msgs/PointCloud2`` of packed points (n,) of ``POINT_DTYPE``."""
-    offsets = POINT_DTYPE.fields or {}
     fields = [
-        messages.make(
-            "PointField",
-            name=name,
-            offset=offsets[name][1],
-            datatype=_POINT_FIELD_TYPES[kind],
-            count=1,
-        )
-        for name, kind in CLOUD_FIELDS
+        messages.make("PointField", name=name, offset=offset, datatype=datatype, count=count)
+        for name, offset, datatype, count in _POINT_LAYOUT
     ]
     return messages.make(
         "PointCloud2",

@@ -23,6 +23,7 @@ from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.samples.blocks import AccelerationBlock
 from omsm_ros.core.spectra.density import density
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import LENGTH
 from omsm_ros.units import NANOMETRE_M
 from omsm_ros.viewing.running_map import Grid, RunningMap
 
@@ -37,6 +38,9 @@ _SPECTRUM_LINES = 512
 _SEVERITY = ("OK", "WARN", "STALE", "ERROR")
 # A node that says nothing for so long is gone.
 _FORGOTTEN_S = 10.0
+# What one cell has, and others may say of it; a stranger on /diagnostics can have any number.
+_MOST_NODES = 64
+_MOST_NAME, _MOST_MESSAGE, _MOST_VALUE = 200, 500, 5000
 # Header of the binary part: cells along a side, generation, changed cells, version.
 _HEADER = struct.Struct("<IIIQ")
 
@@ -66,18 +70,23 @@ class LiveView:
             return
         x, y = (np.asarray(cloud[name], np.float64) for name in "xy")
         height = np.asarray(cloud["height"], np.float64)
+        # What lies on no machine would stretch the map until the part is one cell of it.
+        x, y, height = (LENGTH.or_lost(column) for column in (x, y, height))
         if self._nominal is not None:
             height = height - self._nominal.height(x, y)
-        error = np.asarray(cloud["dynamic_error"], np.float64)
-        spread = np.asarray(cloud["uncertainty"], np.float64)
+        error, spread = (
+            LENGTH.or_lost(np.asarray(cloud[name], np.float64))
+            for name in ("dynamic_error", "uncertainty")
+        )
+        known = np.isfinite(error) & np.isfinite(spread)
         with self._lock:
             taken = self._map.add(x, y, np.column_stack([height, error, spread]))
             self._points += len(cloud)
             self._left_out += len(cloud) - taken
-            self._bin.append(
-                (float(np.nanmin(error)), float(np.nanmax(error)), float(np.nanmedian(spread)))
-            )
-            self._close_bin()
+            if known.any():
+                error, spread = error[known], spread[known]
+                self._bin.append((float(error.min()), float(error.max()), float(np.median(spread))))
+                self._close_bin()
 
     def _close_bin(self) -> None:
         now = self._monotonic()
@@ -89,9 +98,20 @@ class LiveView:
         self._bin, self._bin_start = [], now
 
     def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
-        """Take in what a node says of itself; level "OK", "WARN", "STALE" or "ERROR"."""
-        state = {"name": name, "level": level, "message": message[:500], "values": dict(values)}
+        """Take in what a node says of itself; level "OK", "WARN", "STALE" or "ERROR".
+
+        Raises DataError for one node more than a cell has.
+        """
+        name = name[:_MOST_NAME]
+        kept = {key[:_MOST_NAME]: value[:_MOST_VALUE] for key, value in values.items()}
+        message = message[:_MOST_MESSAGE]
+        state = {"name": name, "level": level, "message": message, "values": kept}
         with self._lock:
+            if name not in self._nodes and len(self._nodes) >= _MOST_NODES:
+                raise DataError(
+                    f"states of more than {_MOST_NODES} nodes, all of this cell: {name!r} is not "
+                    "shown; end who else says such on /diagnostics, and start the viewer again"
+                )
             self._nodes[name] = (self._monotonic(), state)
 
     def set_calibration(self, calibration: Calibration) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 import http
 import threading
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -14,10 +14,13 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.storage import strict_json
+from omsm_ros.viewing.few_connections import FewConnections
 from omsm_ros.viewing.live_view import LiveView
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MOST_BROWSERS = 16
+# Those of the browsers, pages on their way, and some that only knock: each is two files, a thread.
+_MOST_CONNECTIONS = 64
 _PERIOD_S = 0.25
 _STATES_EVERY = 2
 # A browser has nothing to say.
@@ -57,19 +60,20 @@ class LiveServer:
     def start(self) -> None:
         """Listen; ConfigurationError if the port is taken."""
         try:
-            self._server = serve(
-                self._handle,
-                self._host,
-                self._wanted,
-                process_request=self._answer,
-                max_size=_MOST_BYTES_RECEIVED,
-                compression=None,
-                close_timeout=1,
-            )
-        except OSError as err:
+            listening = FewConnections(self._host, self._wanted, _MOST_CONNECTIONS)
+        except (OSError, UnicodeError) as err:
             raise ConfigurationError(
                 f"viewer cannot listen on {self._host}:{self._wanted}: {err}; choose another port"
             ) from err
+        self._server = serve(
+            self._handle,
+            sock=listening,
+            process_request=self._answer,
+            max_size=_MOST_BYTES_RECEIVED,
+            compression=None,
+            close_timeout=1,
+        )
+        self._server.handler = listening.leaving_after(self._server.handler)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def stop(self) -> None:
@@ -80,7 +84,13 @@ class LiveServer:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the page, a refusal, or None where the socket may be opened."""
-        place = urlsplit(request.path)
+        if (place := _split(request.path)) is None:
+            return _text(http.HTTPStatus.BAD_REQUEST, "the address cannot be read\n")
+        # Before websockets 17 a request has no method but GET.
+        if getattr(request, "method", "GET") != "GET":
+            refusal = _text(http.HTTPStatus.METHOD_NOT_ALLOWED, "the page is only read: GET\n")
+            refusal.headers["Allow"] = "GET"
+            return refusal
         given = parse_qs(place.query).get("token", [""])[0]
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             return _text(http.HTTPStatus.FORBIDDEN, "the address lacks its token\n")
@@ -101,10 +111,13 @@ class LiveServer:
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1 or len(origins) > 1:
             return False
-        name = urlsplit(f"//{hosts[0]}").hostname or ""
-        if self._host in LOOPBACK and name not in LOOPBACK:
+        host = _split(f"//{hosts[0]}")
+        if host is None or (self._host in LOOPBACK and host.hostname not in LOOPBACK):
             return False
-        return not origins or urlsplit(origins[0]).netloc == hosts[0]
+        if not origins:
+            return True
+        origin = _split(origins[0])
+        return origin is not None and origin.netloc == hosts[0]
 
     def _handle(self, connection: ServerConnection) -> None:
         if not self._browsers.acquire(blocking=False):
@@ -131,6 +144,14 @@ class LiveServer:
                 connection.recv(timeout=_PERIOD_S)  # says nothing of use, but tells a closed line
             except TimeoutError:
                 continue
+
+
+def _split(address: str) -> SplitResult | None:
+    """Return the parts of an address, None where it is none (``//[::1``)."""
+    try:
+        return urlsplit(address)
+    except ValueError:
+        return None
 
 
 def _html(text: str) -> Response:

@@ -238,6 +238,41 @@ def test_a_cloud_of_others_is_told(change):
         conversions.cloud_array(message)
 
 
+def others_fields(message):
+    message.fields[3].name = "depth"
+
+
+def moved_field(message):
+    message.fields[0].offset = 4
+
+
+def doubled_field(message):
+    message.fields.append(message.fields[0])
+
+
+def half_of_the_bytes(message):
+    message.data = message.data[: len(message.data) // 2]
+
+
+def odd_bytes(message):
+    message.data = message.data[:41]
+
+
+def more_points(message):
+    message.width = 2**32 - 1
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [others_fields, moved_field, doubled_field, half_of_the_bytes, odd_bytes, more_points],
+)
+def test_a_cloud_of_another_layout_is_refused_and_never_misread(spoil):
+    message = conversions.cloud_message(bag_messages(), pack_points(cloud(2)), 0)
+    spoil(message)
+    with pytest.raises(DataError, match=r"expected .*; give one that the corrector published"):
+        conversions.cloud_array(message)
+
+
 def test_a_bag_of_ours_holds_the_bytes_of_the_standard(tmp_path, small_scan_blocks):
     """Read by the library of the format: topics, times, and each message by hand."""
     path = tmp_path / "a.mcap"

@@ -7,6 +7,7 @@ import pytest
 from omsm_ros.core.correction.surface_points import POINT_DTYPE
 from omsm_ros.core.samples.blocks import AccelerationBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import DataError
 from omsm_ros.viewing.live_view import LiveView
 
 
@@ -180,3 +181,35 @@ def test_points_that_are_no_numbers_are_counted(clock):
     view.add_points(cloud([0.0, np.nan], [0.0, 0.0], [1e-9, 1e-9]))
     state = view.state()
     assert (state["points"], state["left_out"]) == (2, 1)
+
+
+def test_a_point_on_no_machine_neither_stretches_the_map_nor_spoils_a_cell(clock):
+    view = LiveView(monotonic=clock)
+    good = (np.linspace(-1e-3, 1e-3, 500), np.zeros(500), np.full(500, 5e-9))
+    view.add_points(cloud(*good))
+    before = view.state()["grid"]["pitch"]
+    for far in ([3e38, 0.0, 1e-9], [0.0, -1e30, 1e-9], [0.0, 0.0, 1e300]):
+        view.add_points(cloud(*([value] for value in far)))
+    view.add_points(cloud([0.0], [0.0], [5e-9], error=np.float32(3e38)))
+    state = view.state()
+    assert state["left_out"] == 4
+    assert state["grid"]["pitch"] == before
+    *_, layers = unpacked(view.news(-1, 0))
+    assert np.isfinite(layers).all()
+
+
+def add_states(view, count):
+    for k in range(count):
+        view.add_state(f"/omsm/{k}", "OK", "x" * 10_000, {"k" * 10_000: "v" * 100_000})
+
+
+def test_a_stranger_with_any_number_of_names_fills_no_memory(clock):
+    view = LiveView(monotonic=clock)
+    view.add_state("/omsm/corrector", "OK", "correcting", {})
+    with pytest.raises(DataError, match=r"more than 64 nodes.*diagnostics"):
+        add_states(view, 1000)
+    view.add_state("/omsm/corrector", "WARN", "no calibration", {})
+    state = view.state()
+    assert len(state["nodes"]) == 64
+    assert len(str(state)) < 64 * 10_000
+    assert state["nodes"][0]["message"] == "no calibration"

@@ -1,12 +1,16 @@
 """The server: the page and the socket on one port, for this computer, or with a token."""
 
+import contextlib
 import html
 import json
 import re
+import resource
+import socket as sockets
 import time
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -170,3 +174,71 @@ def test_a_server_that_ends_lets_go_of_its_port(serve, view):
             until_closed(socket)
     time.sleep(0.1)
     assert serve(port=port).address == f"http://127.0.0.1:{port}/"
+
+
+GOOD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+
+def port_of(server):
+    return int(re.search(r":(\d+)/", server.address)[1])
+
+
+def answer_to(server, request):
+    """Return what comes back for the bytes of a request."""
+    with sockets.create_connection(("127.0.0.1", port_of(server)), timeout=5) as line:
+        line.sendall(request)
+        return b"".join(iter(lambda: line.recv(65536), b"")).decode()
+
+
+@pytest.mark.parametrize(
+    ("request_line", "more", "status"),
+    [
+        ("GET /", "Host: [::1", 403),
+        ("GET /live", "Host: 127.0.0.1\r\nOrigin: http://[::1", 403),
+        ("GET //[", "Host: 127.0.0.1", 400),
+        ("POST /", "Host: 127.0.0.1", 405),
+        ("HEAD /", "Host: 127.0.0.1", 405),
+        ("DELETE /live", "Host: 127.0.0.1", 405),
+    ],
+)
+def test_a_foolish_request_is_refused_without_a_traceback(
+    serve, caplog, request_line, more, status
+):
+    told = answer_to(serve(), f"{request_line} HTTP/1.1\r\n{more}\r\n\r\n".encode())
+    assert told.startswith(f"HTTP/1.1 {status} ")
+    assert not caplog.records
+
+
+def test_who_only_knocks_leaves_room_for_a_browser_and_too_many_are_told(serve):
+    server = serve()
+    with ExitStack() as idle:
+        for _ in range(64):
+            idle.enter_context(sockets.create_connection(("127.0.0.1", port_of(server)), 5))
+        time.sleep(0.3)
+        with pytest.raises(urllib.error.HTTPError, match="503"):
+            urllib.request.urlopen(server.address)
+    told = ""
+    for _ in range(50):
+        time.sleep(0.05)
+        told = answer_to(server, GOOD)
+        if not told.startswith("HTTP/1.1 503 "):
+            break
+    assert told.startswith("HTTP/1.1 200 ")
+
+
+def test_the_page_is_there_again_after_the_process_ran_out_of_files(serve):
+    """A server that stopped at the first failure of accept was silent for good."""
+    server = serve()
+    least = len(list(Path("/proc/self/fd").iterdir()))
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as files:
+        line = files.enter_context(sockets.socket())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (least + 20, limits[1]))
+        files.callback(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
+        for _ in range(20):
+            with contextlib.suppress(OSError):
+                files.enter_context(Path("/dev/null").open())
+        line.connect(("127.0.0.1", port_of(server)))
+        time.sleep(0.5)
+    with urllib.request.urlopen(server.address, timeout=5) as answer:
+        assert answer.status == 200
