@@ -16,7 +16,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader
 
 from omsm_ros.core.samples.blocks import AccelerationBlock, AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError, DataError
@@ -34,6 +33,7 @@ from omsm_ros.storage.bag_checks import (
 )
 from omsm_ros.storage.block_table import long_blocks
 from omsm_ros.storage.message_types import typestore
+from omsm_ros.storage.recording.chunk_reader import MessageReader
 from omsm_ros.storage.recording.topics import (
     ACCELERATION_TOPIC,
     AXES_TOPIC,
@@ -116,7 +116,7 @@ class BagReader:
             check_files(self.path)
             if self.path.is_file():
                 check_kind(self.path)
-            self._reader = opening.enter_context(Reader(self.path))
+            self._reader = opening.enter_context(MessageReader(self.path))
             check_index(self.path, self._reader)
             check_checksums(self.path)
             held = {c.topic: c.msgtype for c in self._reader.connections}
