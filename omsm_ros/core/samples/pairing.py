@@ -29,6 +29,11 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
 STAMP_TOLERANCE_S = 0.5
+# No stream waits for its partner so long: one of two heads further apart has no time of this world.
+_NO_WAIT_S = 3e7
+# What a head may cost of the other stream though all of that came later. After a clock was set back
+# it may be right; of a stamp that was wrong alone, the other stream would be lost from then on.
+_PATIENCE_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,19 +229,25 @@ class Pairing:
         self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
         self._link = _Link(-1, -1)
         self._held: deque[tuple[Run, Run]] = deque()
+        # A head that the other stream's could not be paired with, and what that cost so far [ns].
+        self._kept: Run | None = None
+        self._cost_ns = 0.0
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
         """Yield complete runs of axes and distance, of equal count and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
-            if order < 0:
+            if order == 0:
+                yield from self._joined(a, d)
+            elif not self._linked(a, d) and self._stray(*((a, d) if order < 0 else (d, a))):
+                self.axes.drop(len(a))
+                self.distance.drop(len(d))
+            elif order < 0:
                 samples = self._leading(a, d.first, a, d)
                 self.axes.drop(samples, _missing(a, self.distance))
-            elif order > 0:
+            else:
                 samples = self._leading(d, a.first, a, d)
                 self.distance.drop(samples, _missing(d, self.axes))
-            else:
-                yield from self._joined(a, d)
 
     def end(self) -> Iterator[tuple[Run, Run]]:
         """Yield the pairs that still wait to be settled, as far as stamps can tell; none follow."""
@@ -270,6 +281,18 @@ class Pairing:
                 self.axes.settle(a, d.reasons)
                 self.distance.settle(d, a.reasons)
                 yield a, d
+
+    def _stray(self, dropped: Run, kept: Run) -> bool:
+        """Return whether ``kept``, for which the other head is to be dropped, is no better."""
+        if self._kept is not kept:
+            self._kept, self._cost_ns = kept, 0.0
+        later_ns = dropped.stamp_ns - kept.stamp_ns
+        if later_ns > 0:
+            self._cost_ns += len(dropped) * dropped.period_ns
+        return (
+            abs(later_ns) > _NO_WAIT_S * NANOSECONDS_PER_S
+            or self._cost_ns > _PATIENCE_S * NANOSECONDS_PER_S
+        )
 
     def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
         """Return samples of ``run`` before the other head, all of them if the sessions differ."""

@@ -101,7 +101,8 @@ class _Newest:
         anew = bool(self._parts) and first < self.end
         if anew:
             self._parts.clear()
-        self.period, self.most = period, min(round(_SPAN_S / period), _MOST_SAMPLES)
+        # Of samples further apart than the span the newest one is kept.
+        self.period, self.most = period, min(max(round(_SPAN_S / period), 1), _MOST_SAMPLES)
         self._parts.append((first, values))
         self.end = first + len(values)
         while self._parts[0][0] + len(self._parts[0][1]) <= self.end - self.most:

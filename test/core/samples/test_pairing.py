@@ -122,6 +122,46 @@ def test_a_false_start_of_one_stream_does_not_cost_the_scan() -> None:
     assert [pair for pair in bench.found if pair[1] == 1] == [(0, 1, k) for k in range(50, 500)]
 
 
+@pytest.mark.parametrize("wrong_s", [-1.6e9, -100.0, 5e8])
+@pytest.mark.parametrize("swap", [False, True])
+def test_one_block_with_a_wrong_stamp_costs_seconds_and_not_the_scan(
+    wrong_s: float, swap: bool
+) -> None:
+    """Of a stamp far ahead the stream's next block begins anew; of one long ago it goes on."""
+    now = 1.7e9
+    good = [run(0, k, 100, now + k * 1e-3) for k in range(0, 60_000, 100)]
+    fits = [run(0, k, 100, now + k * 1e-3) for k in range(0, 10_000, 100)]
+    later = 2 if wrong_s > 0 else 1
+    fits += [run(1, 10_000, 100, now + wrong_s)]
+    fits += [run(later, k, 100, now + k * 1e-3) for k in range(10_100, 60_000, 100)]
+    bench = Bench()
+    for a, d in zip(good, fits, strict=True):
+        bench.push([d], [a]) if swap else bench.push([a], [d])
+    lost = 60_000 - len(bench.found)
+    assert 100 <= lost < 11_000
+    assert bench.counts()[-1] == 59_999
+    assert bench.pairing.axes.pending == bench.pairing.distance.pending == 0
+
+
+def test_a_recording_is_paired_though_a_block_from_nowhere_waits() -> None:
+    """Played after live samples, of which a stray block with no partner was the last."""
+    bench = Bench().push([], [run(0, 7, 100, 2.1e9)])
+    bench.push([run(1, 0, 5000, 1.0)], [run(1, 0, 5000, 1.0)])
+    bench.push([run(1, 5000, 5000, 6.0)], [run(1, 5000, 5000, 6.0)])
+    assert bench.counts() == list(range(5000, 10_000))
+
+
+def test_leftovers_of_minutes_cost_the_next_motion_nothing() -> None:
+    """The probe failed, the axes went on; then both began anew, perhaps with another clock."""
+    for restart_s in (110.0, 1000.0):
+        bench = Bench()
+        bench.push([run(0, 0, 1000)], [run(0, 0, 1000)])
+        bench.push([run(0, 1000 + k, 100, 1.0 + k * 1e-3) for k in range(0, 100_000, 100)], [])
+        both = [run(1, k, 100, restart_s + k * 1e-3) for k in range(0, 5000, 100)]
+        bench.push(both, both)
+        assert bench.counts() == [*range(1000), *range(5000)]
+
+
 def test_a_bounded_queue_gives_the_oldest_up_and_tells_it_from_what_has_no_partner() -> None:
     bench = Bench().push([run(0, 0, 60), run(0, 60, 60)], [])
     bench.pairing.axes.limit(100)

@@ -75,3 +75,13 @@ def test_nothing_is_told_of_counts_that_only_one_stream_has() -> None:
     watch.add(came[-1][0])
     watch.judge()
     assert watch.established is None
+
+
+@pytest.mark.parametrize("period", [1e-7, 5.0, 10.0])
+def test_samples_of_any_period_that_may_come_are_taken(period: float) -> None:
+    """Of ten seconds none lay within the span that is kept, and there was nothing to take."""
+    came = [
+        (replace(axes, sample_period=period), replace(distance, sample_period=period))
+        for axes, distance in blocks(motion("chirp"), 0)[:5]
+    ]
+    assert watched(came).established is None
