@@ -22,10 +22,11 @@ from __future__ import annotations
 import ctypes
 import time
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import numpy as np
 
+from omsm_ros.devices.addresses import parts_of
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.protocols.generic_stream import BODY_SIZE, FRAME, encode_frames
 
@@ -49,7 +50,7 @@ class AdsRing:
 
     def __init__(self, address: str) -> None:
         """Raise ConfigurationError for an address that is none."""
-        parts = urlsplit(address)
+        parts = parts_of(address)
         query = parse_qs(parts.query)
         samples = query.get("samples", [str(DEFAULT_SAMPLES)])[0]
         usable = samples.isdecimal() and 0 < int(samples[:9]) <= _MOST_SAMPLES

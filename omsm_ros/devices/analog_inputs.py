@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.devices.addresses import parts_of
 from omsm_ros.errors import ConfigurationError, DeviceError
 
 # The driver's buffer holds ten seconds: longer than any pause of a healthy host.
@@ -51,7 +52,7 @@ class NidaqInput:
 
     def __init__(self, address: str, channels: int) -> None:
         """Raise ConfigurationError for an address that is none."""
-        parts = urlsplit(address)
+        parts = parts_of(address)
         query = {name: values[0] for name, values in parse_qs(parts.query).items()}
         if not parts.netloc or len(parts.path) < 2 or set(query) - {"range", "clock"}:
             raise ConfigurationError(
@@ -143,7 +144,7 @@ class SyntheticInput:
         self, address: str, channels: int, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         """Raise ConfigurationError for an address that is none."""
-        parts = urlsplit(address)
+        parts = parts_of(address)
         query = {name: values[0] for name, values in parse_qs(parts.query).items()}
         values = {"frequency": 100.0, "amplitude": 0.01, "noise": 1e-4}
         if set(query) - set(values) or parts.netloc:
@@ -191,7 +192,7 @@ def analog_input(address: str, channels: int) -> AnalogInput:
 
     Raises ConfigurationError.
     """
-    scheme = urlsplit(address).scheme
+    scheme = parts_of(address).scheme
     if scheme == "daq":
         return NidaqInput(address, channels)
     if scheme == "synthetic":

@@ -140,6 +140,8 @@ class DeviceReader:
         """Disconnect and hand over the partial block, whatever state the device is in."""
         try:
             self._hand_over(self._device.close())
+        except (DeviceError, ConfigurationError) as err:
+            self._tell(str(err))
         except Exception as err:  # a defect of ours must not end the reading for good
             self._tell(defect(err))
 

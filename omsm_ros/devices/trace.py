@@ -7,7 +7,8 @@ One event a line: seconds since the trace began, a sign (``<`` from the device, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -47,12 +48,8 @@ class TracedTransport:
     def open(self) -> None:
         """Connect; raises DeviceError, or ConfigurationError if the trace cannot be written."""
         self.close()
-        try:
+        with self._telling():
             self._file = self._path.open("a" if self._begun else "w", encoding="ascii")
-        except OSError as err:
-            raise ConfigurationError(
-                f"cannot write the trace {str(self._path)!r}: {err}; choose another place"
-            ) from err
         self._began = self._began if self._begun else self._monotonic()
         self._begun = True
         self._transport.open()
@@ -74,13 +71,30 @@ class TracedTransport:
         """Disconnect."""
         self._transport.close()
         if self._file is not None:
-            self._note("!", CLOSED)
-            self._file.close()
-            self._file = None
+            file, self._file = self._file, None
+            with self._telling():
+                try:
+                    file.write(self._line("!", CLOSED))
+                finally:
+                    file.close()
 
     def _note(self, sign: str, text: str) -> None:
         if self._file is not None:
-            self._file.write(f"{self._monotonic() - self._began:.6f} {sign} {text}\n")
+            with self._telling():
+                self._file.write(self._line(sign, text))
+
+    def _line(self, sign: str, text: str) -> str:
+        return f"{self._monotonic() - self._began:.6f} {sign} {text}\n"
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Raise ConfigurationError, with the remedy, where the trace cannot be written."""
+        try:
+            yield
+        except (OSError, ValueError) as err:  # a full disk, no such folder; NUL in the path
+            raise ConfigurationError(
+                f"cannot write the trace {str(self._path)!r}: {err}; choose another place, or none"
+            ) from err
 
 
 @dataclass(frozen=True, slots=True)

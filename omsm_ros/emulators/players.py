@@ -23,11 +23,13 @@ from omsm_ros.emulators.tcp_server import TcpServer
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.protocols.chrocodile_readings import ProbeReading
 from omsm_ros.protocols.generic_stream import AXES, StreamScaling
+from omsm_ros.quantities import TCP_PORT
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.channels import ReferenceSensor
 from omsm_ros.units import MICROMETRE_M
 
 _TCP = "tcp://127.0.0.1:"
+_PORT_DIGITS = 10  # what int reads at once, whatever it may be
 _END_S = 5.0
 # The twin's probe measures about its middle, this one from the beginning of its range.
 _READING = ProbeReading(full_scale=100 * MICROMETRE_M, zero=Probe().half_range)
@@ -40,11 +42,12 @@ def line_for(link: str) -> Pty | TcpServer:
     """Return the emulated port: ``tcp://127.0.0.1:port`` or a pseudo-terminal's path."""
     if not link.startswith("tcp://"):
         return Pty(link)
-    if not (link.startswith(_TCP) and link.removeprefix(_TCP).isdecimal()):
+    port = link.removeprefix(_TCP)
+    if not (link.startswith(_TCP) and port.isdecimal() and len(port) <= _PORT_DIGITS):
         raise ConfigurationError(
             f"link {link!r}, expected a path or {_TCP}PORT: an emulator stays on this machine"
         )
-    return TcpServer(int(link.removeprefix(_TCP)))
+    return TcpServer(TCP_PORT.checked(int(port), ConfigurationError, f"port of link {link!r}"))
 
 
 class Player(Protocol):

@@ -148,4 +148,7 @@ class Pty:
         self._link.symlink_to(self._slave_name)
 
     def _points_here(self, link: Path) -> bool:
-        return link.is_symlink() and os.readlink(link) == self._slave_name
+        try:
+            return link.is_symlink() and os.readlink(link) == self._slave_name
+        except OSError:  # a name that can be none
+            return False

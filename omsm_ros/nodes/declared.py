@@ -17,10 +17,12 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, shortened
 from omsm_ros.parameters import Parameter
 
 _QOS_PREFIX = "qos_overrides."
+# Of a name that is none, in an answer.
+_MOST_CHARACTERS = 80
 _TYPES = range(ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_STRING_ARRAY + 1)
 
 
@@ -80,6 +82,7 @@ class Declared:
         """Raise ConfigurationError for one that the node does not have, with the nearest one."""
         for name in names:
             if not self._node.has_parameter(name):
+                name = shortened(name, _MOST_CHARACTERS)
                 near = difflib.get_close_matches(name, self._parameters, 1)
                 hint = f"did you mean {near[0]!r}?" if near else "`ros2 param list` shows them all"
                 raise ConfigurationError(f"unknown parameter {name!r}; {hint}")

@@ -21,6 +21,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -61,6 +62,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             super().__init__(name, namespace=NAMESPACE)
         except InvalidParameterTypeException as err:  # of one that rclpy itself has: use_sim_time
             raise ConfigurationError(f"{name}: {err}") from err
+        except rclpy_implementation.RCLError as err:
+            if "invalid" not in str(err):
+                raise
+            what = str(err).split(", at ")[0]
+            raise ConfigurationError(f"{name}: {what}; give another __node or __ns") from err
         self.stage = Stage.UNCONFIGURED
         self.values: dict[str, Any] = {}
         self.fatal: OmsmError | None = None

@@ -11,7 +11,7 @@ from std_msgs.msg import String
 
 from omsm_ros import quantities
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.recent import Flow
+from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.core.spectra.running_spectrum import (
     AXES,
     CARRIAGE,
@@ -67,7 +67,8 @@ class VibrationMonitorNode(ManagedNode):
             )
         )
         self._alarm = Alarm(values["alarm"], values["release"])
-        self._refused = ""
+        self._refused, self._blocks_refused = "", 0
+        self._lately = RecentIncrease()
         self._flow, self._block = Flow(), 0.0
         self._calibration: Calibration | None = None
         self._topic = CalibrationTopic(self, undo, self._use, listens=True)
@@ -89,6 +90,7 @@ class VibrationMonitorNode(ManagedNode):
             self._running.push(block)
         except OmsmError as err:
             self._refused = str(err)
+            self._blocks_refused += 1
             return
         self._block = len(block) * block.sample_period
         levels = self._levels()
@@ -137,7 +139,9 @@ class VibrationMonitorNode(ManagedNode):
             if levels.effect is None:
                 report.add(WARN, "effect on a height not evaluated: no calibration yet")
         self._add_silence(report, time.monotonic())
-        if self._refused:
+        refused = {"blocks_refused": self._blocks_refused}
+        report.values |= refused
+        if self._lately.update(refused, time.monotonic()):
             report.add(WARN, f"a block was refused: {self._refused}")
         return report
 

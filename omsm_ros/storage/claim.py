@@ -17,8 +17,10 @@ def claimed(path: Path) -> Iterator[None]:
     """Hold ``path``, which need not exist, for this process alone.
 
     The system lets go of it however the process ends. Raises ConfigurationError if another one
-    holds it, FileError if its folder cannot be written.
+    holds it or it names no file, FileError if its folder cannot be written.
     """
+    if path.name in ("", ".."):
+        raise ConfigurationError(f"{str(path)!r} names no file; give a name in a folder")
     lock = path.with_name(f".{path.name[-200:]}.lock")
     try:
         held = _locked(lock)

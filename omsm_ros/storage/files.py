@@ -35,6 +35,8 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
     try:
         with open_regular(path, error, what) as stream:
             raw = stream.read(limit + 1)
+        if raw is None:  # of the kernel's own files, some give lines as they come
+            raise BlockingIOError("there is nothing to read now")
         if len(raw) <= limit:
             return raw.decode("utf-8")
     except (OSError, UnicodeDecodeError) as err:

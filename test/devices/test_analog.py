@@ -150,7 +150,8 @@ def test_the_synthetic_input_keeps_its_rate_and_its_line(host):
 @pytest.mark.parametrize(
     "address",
     ["daq://", "daq://Dev1", "daq://Dev1/ai0?gain=3", "daq://Dev1/ai0?range=x", "tcp://h:1",
-     "daq://Dev1/ai0?range=0", "synthetic://?volume=11", "synthetic://?noise=nan", ""],
+     "daq://Dev1/ai0?range=0", "synthetic://?volume=11", "synthetic://?noise=nan", "",
+     "daq://[::1/ai0", "//[", "synthetic://[x]y"],
 )  # fmt: skip
 def test_an_address_that_is_none_is_refused(address):
     with pytest.raises(ConfigurationError, match="address"):

@@ -87,6 +87,24 @@ def test_every_connection_is_in_the_trace(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("place", ["/dev/full", "/nonexistent/wire.trace", "/", "wire\0trace"])
+def test_a_trace_that_cannot_be_written_is_told_with_the_remedy_and_the_line_is_let_go(
+    place: str,
+) -> None:
+    loop = Loopback()
+    traced = TracedTransport(loop, Path(place), loop.clock)
+    for _ in range(2):
+        with pytest.raises(ConfigurationError, match=r"cannot write the trace .*choose another"):
+            open_write_close(traced)
+        traced.close()
+
+
+def open_write_close(traced: TracedTransport) -> None:
+    traced.open()
+    traced.write(b"word")
+    traced.close()
+
+
 def test_what_is_no_trace_is_named(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("0.1 < zz\n")

@@ -17,7 +17,7 @@ from omsm_ros.devices.reader import DeviceReader
 from omsm_ros.devices.sensor_factory import REFERENCE_PARAMETERS, make_reference
 from omsm_ros.emulators.generic_stream import Faults
 from omsm_ros.emulators.players import EMULATED, emulated, line_for, player_for
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.twin.cell import Recording
 
 SOON = 20.0
@@ -129,6 +129,17 @@ def test_the_device_beside_it_measures_the_same_motion(
 def test_an_emulator_stays_on_this_machine(link: str) -> None:
     with pytest.raises(ConfigurationError, match="stays on this machine"):
         line_for(link)
+
+
+@pytest.mark.parametrize("port", ["65536", "9999999999", "9" * 5000])
+def test_a_port_beyond_all_ports_is_named(port: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"link 'tcp://127\.0\.0\.1:\d+"):
+        line_for(f"tcp://127.0.0.1:{port}")
+
+
+def test_a_link_too_long_for_a_name_is_refused() -> None:
+    with pytest.raises(DeviceError, match="cannot create link"), line_for("x" * 5000):
+        pass
 
 
 def test_an_unknown_device_is_named() -> None:

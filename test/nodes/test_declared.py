@@ -56,6 +56,7 @@ def test_what_is_not_given_has_its_default_and_a_whole_number_is_a_number():
         ({"port": ""}, "must be given"),
         ({"blok_size": 5}, "did you mean 'block_size'"),
         ({"zzz": 5}, "ros2 param list"),
+        ({"z" * 100_000: 5}, "^.{1,200}$"),
     ],
 )
 def test_what_is_wrong_is_told_with_the_node_when_it_is_configured(given, named):

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_ros.core.samples.blocks import AccelerationBlock
-from omsm_ros.core.samples.recent import Flow
+from omsm_ros.core.samples.recent import Flow, RecentIncrease
 from omsm_ros.core.spectra.running_spectrum import (
     CARRIAGE,
     PROBE,
@@ -25,6 +25,9 @@ from omsm_ros.nodes.vibration_monitor_node import VibrationMonitorNode, _edges
 from omsm_ros.storage import conversions
 
 RATE, LINE_HZ = 2000.0, 120.0
+EMPTY = SimpleNamespace(
+    stamp_ns=0, first_sample=0, sample_period=1 / RATE, x=np.empty(0), y=np.empty(0), z=np.empty(0)
+)
 LIMIT_M = 20e-9
 
 
@@ -54,6 +57,7 @@ def made(now):
         options = MonitorOptions(edges=edges, mount=mount)
         return Monitor(
             _running=RunningSpectrum(options), _alarm=Alarm(LIMIT_M, 0.7), _refused="",
+            _blocks_refused=0, _lately=RecentIncrease(),
             _flow=Flow(), _block=0.0, _calibration=None, _told=0, told=told, logged=[],
             values={"mount": mount}, now=now, sent=0,
             _publisher=SimpleNamespace(publish=lambda m: told.append(json.loads(m.data))),
@@ -179,6 +183,18 @@ def test_a_block_that_is_none_is_refused_by_its_reason(made):
     report = monitor.report()
     assert report.level == WARN
     assert "a block was refused: AccelerationBlock: sample_period is 0.0 s" in report.text
+    assert report.values["blocks_refused"] == 1
+
+
+def test_a_refusal_of_long_ago_is_a_number_only(made, now):
+    monitor = made()
+    monitor._take(conversions.acceleration_message(conversions.ros_messages(), EMPTY), {})
+    assert "refused" in monitor.report().text
+    for _ in range(3):
+        now[0] += 6.0
+        report = monitor.report()
+    assert "refused" not in report.text
+    assert report.values["blocks_refused"] == 1
 
 
 def test_bands_are_numbers_with_spaces_between():

@@ -28,6 +28,12 @@ def test_a_second_one_is_refused_and_a_later_one_is_not(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("path", ["", ".", "..", "/", "a/.."])
+def test_what_names_no_file_is_refused(path: str) -> None:
+    with pytest.raises(ConfigurationError, match="names no file"), claimed(Path(path)):
+        pass
+
+
 def test_who_was_killed_holds_nothing(tmp_path: Path) -> None:
     path = tmp_path / "port"
     process = subprocess.Popen(

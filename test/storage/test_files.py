@@ -1,3 +1,4 @@
+import io
 import json
 
 import numpy as np
@@ -88,6 +89,18 @@ def test_missing_binary_and_huge_files_are_refused(tmp_path):
         stream.truncate(calibration_file.MAX_CALIBRATION_BYTES + 1)
     with pytest.raises(CalibrationError, match="bytes"):
         calibration_file.load_calibration(binary)
+
+
+def test_a_file_that_has_nothing_to_read_now_is_refused(tmp_path, monkeypatch):
+    """As /proc/kmsg: a regular file whose reading waits for the next line of the kernel."""
+
+    class Waits(io.BytesIO):
+        def read(self, size=-1):
+            return None
+
+    monkeypatch.setattr(files, "open_regular", lambda *_: Waits())
+    with pytest.raises(CalibrationError, match="nothing to read now; give a text"):
+        files.read_text(tmp_path / "x", 100, CalibrationError, "calibration")
 
 
 def _calibration(**changes):

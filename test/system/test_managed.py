@@ -150,6 +150,11 @@ def start(node, *arguments):
             "depth of a queue is 99999999999",
             marks=pytest.mark.soak,
         ),
+        (
+            "corrector",
+            ["-r", f"__node:={'a' * 300}"],
+            "should not exceed '255'; give another __node",
+        ),
         ("corrector", ["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
         ("corrector", ["--params-file", "/etc/passwd"], "'/etc/passwd' is no file of parameters"),
         ("confocal_driver", ["-p", "block_size:=-7", "-p", "port:=/dev/null"], "block_size"),
