@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,9 +18,11 @@ from scipy import signal
 
 from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.storage import bags
 from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.storage.conversions import axis_message, distance_message
+from omsm_ros.storage.message_types import bag_messages
 from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -27,28 +30,74 @@ from omsm_ros.units import NANOSECONDS_PER_S
 PAPER_POINTS = 290_011
 # Over five hours at 1 kHz; what is done once, however long a scan is, tells little there.
 LONG_POINTS, LONGEST_POINTS = 20_000_000, 50_000_000
-_BLOCK = 100
+TWO_DRIVERS_POINTS, TWO_DRIVERS_OFFSET = 5_000_000, 4711
+# Samples of a message; of the probe where it has a driver of its own.
+_BLOCK, _PROBE_BLOCK = 100, 64
 _RUNS = 5
 
 
 def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -> None:
-    """A spiral-like motion of ``samples``, cheap to make."""
-    random = np.random.default_rng(seed)
-    noise = random.normal(0.0, 1e-8, block)
-    zero = np.zeros(block)
+    """A spiral-like motion of ``samples``, cheap to make, from one driver of both streams."""
+    noise = np.random.default_rng(seed).normal(0.0, 1e-8, block)
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in range(0, samples, block):
             n = min(block, samples - first)
-            angle = np.pi * 1e-3 * np.arange(first, first + n)
-            radius = np.full(n, 0.0127 * (1 - first / samples))
-            common = {
-                "stamp_ns": first * NANOSECONDS_PER_S // 1000,
-                "first_sample": first,
-                "sample_period": 1e-3,
-            }
-            z = 3.4 * radius**2 * np.cos(2 * angle)
-            bag.write_axes(AxisBlock(**common, x=radius, y=zero[:n], z=z, b=zero[:n], c=angle))
-            bag.write_distance(DistanceBlock(**common, distance=noise[:n]))
+            bag.write_axes(_axes(first, n, samples))
+            bag.write_distance(_distance(first, noise[:n]))
+
+
+def write_two_drivers(path: Path, samples: int, seed: int = 0) -> None:
+    """The same motion as drivers of axes and probe send it side by side.
+
+    Each cuts its own blocks, counts from its own start (the probe's count and TWO_DRIVERS_OFFSET
+    are the axes'), stamps with a clock that scatters by 20 µs, and delivers up to 20 ms late.
+    """
+    random = np.random.default_rng(seed)
+    noise = random.normal(0.0, 1e-8, _BLOCK)
+    sent = [
+        (first + length + random.uniform(0, 20), first, length)
+        for length in (_BLOCK, _PROBE_BLOCK)
+        for first in range(0, samples, length)
+    ]
+    messages = bag_messages()
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
+        for received_ms, first, length in sorted(sent):
+            n = min(length, samples - first)
+            received, late = round(received_ms * 1e6), round(random.normal(20e3, 20e3))
+            if length == _BLOCK:
+                axes = _axes(first, n, samples)
+                count = first + TWO_DRIVERS_OFFSET
+                axes = replace(axes, first_sample=count, stamp_ns=axes.stamp_ns + late)
+                bag.write(bags.AXES_TOPIC, received, axis_message(messages, axes))
+            else:
+                distance = _distance(first, noise[:n])
+                distance = replace(distance, stamp_ns=distance.stamp_ns + late)
+                bag.write(bags.DISTANCE_TOPIC, received, distance_message(messages, distance))
+
+
+def _axes(first: int, n: int, samples: int) -> AxisBlock:
+    angle = np.pi * 1e-3 * np.arange(first, first + n)
+    radius = np.full(n, 0.0127 * (1 - first / samples))
+    zero = np.zeros(n)
+    return AxisBlock(
+        stamp_ns=first * NANOSECONDS_PER_S // 1000,
+        first_sample=first,
+        sample_period=1e-3,
+        x=radius,
+        y=zero,
+        z=3.4 * radius**2 * np.cos(2 * angle),
+        b=zero,
+        c=angle,
+    )
+
+
+def _distance(first: int, distance: FloatArray) -> DistanceBlock:
+    return DistanceBlock(
+        stamp_ns=first * NANOSECONDS_PER_S // 1000,
+        first_sample=first,
+        sample_period=1e-3,
+        distance=distance,
+    )
 
 
 def save_paper_calibration(path: Path) -> None:
@@ -77,11 +126,11 @@ class Used(NamedTuple):
     memory: float
 
 
-def _correct(folder: Path, bag: str, report: bool = False) -> Used:
+def _correct(folder: Path, bag: str, *options: str, report: bool = False) -> Used:
     """``omsm correct`` on a bag, as a process of its own."""
     command = [sys.executable, "-m", "omsm_ros.cli", "correct", str(folder / bag)]
     command += ["--calibration", str(folder / "cal.json"), "--out", str(folder / "result")]
-    command += [] if report else ["--no-report"]
+    command += [*options, *([] if report else ["--no-report"])]
     begin = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -94,7 +143,7 @@ def _correct(folder: Path, bag: str, report: bool = False) -> Used:
 def _whole_processes(folder: Path) -> Iterator[Row]:
     """The paper's scan with and without its page, beside what loading scipy.signal takes."""
     for report, limit in ((False, 1.0), (True, 2.0)):
-        runs = [_correct(folder, "paper.mcap", report) for _ in range(_RUNS)]
+        runs = [_correct(folder, "paper.mcap", report=report) for _ in range(_RUNS)]
         wall, cpu = (float(np.median([getattr(r, n) for r in runs])) for n in ("wall", "cpu"))
         name = f"omsm correct, 290 011 points, whole process, {'' if report else 'no '}report"
         peer = f"{cpu:.2f} s of a core"
@@ -123,8 +172,19 @@ def _rates(folder: Path, samples: int, used: Used, start: Used) -> Iterator[Row]
     filtered = len(z) / (time.process_time() - begin)
     name = "bag to cloud with uncertainty, long bag, samples a second and core"
     yield at_least(name, ours / 1e6, "10⁶/s", 2.5)
+    yield _of_two_drivers(folder, start, ours)
     yield shown("  bare read of the same bag, times as fast", read / ours, "1")
     yield shown("  scipy.signal.lfilter of order 5, times as fast", filtered / ours, "1")
+
+
+def _of_two_drivers(folder: Path, start: Used, of_one: float) -> Row:
+    """The same rate where axes and probe were recorded from drivers of their own."""
+    write_two_drivers(folder / "two.mcap", TWO_DRIVERS_POINTS)
+    used = _correct(folder, "two.mcap", "--counter-offset", str(TWO_DRIVERS_OFFSET))
+    rate = (TWO_DRIVERS_POINTS - PAPER_POINTS) / (used.cpu - start.cpu)
+    text = f"{rate / of_one:.2f} of one driver's"
+    name = "  the same of two drivers, blocks of 100 and 64, offset counters"
+    return at_least(name, rate / 1e6, "10⁶/s", 2.0, text)
 
 
 def rows(full: bool) -> Iterator[Row]:
