@@ -15,7 +15,7 @@ from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
+from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.slips import CommonTrigger, Slip
 from omsm_ros.errors import BagError
@@ -188,23 +188,15 @@ class CorrectedScan:
 def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock | DistanceBlock]:
     """Yield the axes at the probe's samples, and the probe's blocks, as if one trigger had both.
 
-    A block that repeats samples or comes late has no axes; it is counted as what it is.
+    A message that repeats samples or comes late has no axes; it is counted as what it is.
     """
     axes, distance = [], []
-    for _, block in bag.records(*TOPICS):
-        if isinstance(block, AxisBlock):
-            axes.append(block)
-        elif isinstance(block, DistanceBlock):
-            distance.append(block)
-    moved = iter(axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure))
+    for _, _, block in bag.blocks(*TOPICS):
+        (axes if isinstance(block, AxisBlock) else distance).append(block)
+    moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
     at_probe = next(moved, None)
     for block in distance:
-        if at_probe is not None and _same_samples(at_probe, block):
+        if at_probe is not None and at_probe.newest == block.newest:
             yield at_probe
             at_probe = next(moved, None)
         yield block
-
-
-def _same_samples(one: Block, other: Block) -> bool:
-    here, there = ((b.stamp_ns, b.first_sample, len(b)) for b in (one, other))
-    return here == there

@@ -91,6 +91,18 @@ class Block:
         """Trigger counter after the last sample."""
         return self.first_sample + len(self)
 
+    @property
+    def stamps(self) -> IntArray:
+        """First sample and stamp [ns] of each message that it is of, (k, 2)."""
+        return self.parts if len(self.parts) else np.array([(self.first_sample, self.stamp_ns)])
+
+    @property
+    def newest(self) -> tuple[int, int]:
+        """First sample and stamp [ns] of the last message that it is of."""
+        if not len(self.parts):
+            return self.first_sample, self.stamp_ns
+        return int(self.parts[-1, 0]), int(self.parts[-1, 1])
+
     def _check(
         self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
     ) -> None:

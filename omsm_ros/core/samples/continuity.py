@@ -65,7 +65,7 @@ class TriggerCount:
         late = self._filled(first, first + skip) if skip else 0
         if skip < length:
             self._next = end
-            self._newest_first, self._newest_stamp_ns = first, block.stamp_ns
+            self._newest_first, self._newest_stamp_ns = block.newest
         return Arrival(self._session, first, skip, late, missing)
 
     def _filled(self, first: int, end: int) -> int:

@@ -9,16 +9,16 @@ are axis blocks as the probe's own trigger would have latched them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray, no_parts
+from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
-from omsm_ros.core.samples.merging import uninterrupted
+from omsm_ros.core.samples.merging import uninterrupted, without_first
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -64,9 +64,10 @@ def fit_clock(blocks: Sequence[Block]) -> Clock:
     Raises DataError if the stamps contradict the blocks' sample period.
     """
     nominal = blocks[0].sample_period * NANOSECONDS_PER_S
-    first, start = blocks[0].first_sample, blocks[0].stamp_ns
-    count = np.array([b.first_sample - first for b in blocks], np.float64)
-    late = np.array([b.stamp_ns - start for b in blocks], np.float64) - count * nominal
+    stamps = np.concatenate([block.stamps for block in blocks])
+    first, start = stamps[0].tolist()
+    count, since = (stamps - stamps[0]).T.astype(np.float64)
+    late = since - count * nominal
     if np.ptp(count) == 0:
         return Clock(first, start, float(late.mean()), nominal, 0.0)
     centred = count - count.mean()
@@ -91,13 +92,14 @@ def axes_at_probe(
     *,
     delay: float = 0.0,
     exposure: float = 0.0,
-) -> list[AxisBlock]:
-    """Return an axis block for every distance block, of the same counts, stamp and period.
+) -> Iterator[AxisBlock]:
+    """Return an axis block for every distance block, of the same counts, stamps and period.
 
     delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
     exposure: over which the probe averages, and so is the motion [s]
 
-    Samples that no run of axis samples covers are NaN. Raises DataError if there is nothing
+    A message of the probe of which samples were there before has none. Samples that no run of axis
+    samples covers are NaN. Raises DataError if there is nothing
     to interpolate, ConfigurationError for an exposure that is negative or not finite.
     """
     if not (np.isfinite(delay) and 0 <= exposure < np.inf):
@@ -112,11 +114,10 @@ def axes_at_probe(
         )
     nodes = delay + (0.5 * exposure * _EXPOSURE_NODES if exposure else np.zeros(1))
     weights = _EXPOSURE_WEIGHTS if exposure else np.ones(1)
-    blocks = []
-    for session in _sessions(distance):
-        clock = fit_clock(session)
-        blocks += [_at(block, clock, tracks, nodes, weights) for block in session]
-    return blocks
+    clocks = [(fit_clock(session), session) for session in _sessions(distance)]
+    return (
+        _at(block, clock, tracks, nodes, weights) for clock, session in clocks for block in session
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +152,8 @@ def _at(
     count = block.first_sample + np.arange(len(block), dtype=np.float64)
     values = np.full((len(block), len(_AXES)), np.nan)
     for track in tracks:
-        if track.spline is None:
+        begin, end = clock.since(count[[0, -1]], track.origin_ns) + nodes[[0, -1]]
+        if track.spline is None or end < track.begin or begin > track.end:
             continue
         time = clock.since(count, track.origin_ns)
         inside = (time + nodes.min() >= track.begin) & (time + nodes.max() <= track.end)
@@ -163,18 +165,19 @@ def _at(
         stamp_ns=block.stamp_ns,
         first_sample=block.first_sample,
         sample_period=block.sample_period,
-        parts=no_parts(),
+        parts=block.parts,
         **channels,
     )
 
 
 def _sessions(blocks: Iterable[B]) -> list[list[B]]:
-    """Return the blocks by session, without those that overlap or come late."""
+    """Return the blocks by session, without messages that overlap or come late."""
     count, placed = TriggerCount(), []
     for block in blocks:
-        admission = count.place(block, len(block))
-        if admission.skip == 0:
-            placed.append((admission.session, block))
+        arrival = count.place(block, len(block))
+        again = int(np.searchsorted(block.stamps[:, 0], arrival.first + arrival.skip))
+        if again < len(block.stamps):
+            placed.append((arrival.session, without_first(block, again)))
     return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
 
 

@@ -83,3 +83,18 @@ def joined(run: Sequence[B]) -> B:
             for name in _channels(run[0])
         },
     )
+
+
+def without_first(block: B, messages: int) -> B:
+    """Return a block that was joined of several messages without the first of them."""
+    if not messages:
+        return block
+    first, stamp_ns = block.parts[messages].tolist()
+    start = first - block.first_sample
+    return replace(
+        block,
+        first_sample=first,
+        stamp_ns=stamp_ns,
+        parts=block.parts[messages:],
+        **{name: getattr(block, name)[start:] for name in _channels(block)},
+    )

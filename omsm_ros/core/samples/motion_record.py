@@ -275,7 +275,7 @@ def _by_stamp(
     if finer * sum(map(len, distance)) > MAX_RECORD_SAMPLES:
         raise DataError(f"readings every {probe_period:g} s, axes every {axis_period:g} s: {_LONG}")
     grid = [_refined(block, finer) for block in _ordered(distance)]
-    moved = axes_at_probe(_ordered(axes), grid)
+    moved = list(axes_at_probe(_ordered(axes), grid))
     second = []
     if reference:
         carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)

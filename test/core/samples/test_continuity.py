@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 
 from omsm_ros.core.samples.blocks import Block
@@ -106,3 +107,16 @@ def test_after_an_end_everything_is_new(stream: Stream) -> None:
     stream(0, 0.0)
     stream.sequence.end()
     assert stream(100, 0.1) == Arrival(1, 100, 0, 0)
+
+
+def test_a_clock_set_back_is_seen_after_messages_that_a_bag_joined() -> None:
+    """Of a block of a minute the last message counts, as where each comes by itself."""
+    parts = np.array([(100 * k, 100_000_000 * k) for k in range(600)])
+    for joined in (False, True):
+        sequence = TriggerCount()
+        if joined:
+            sequence.place(replace(block(0, 0.0), parts=parts), 60_000)
+        else:
+            for first, stamp_ns in parts.tolist():
+                sequence.place(block(first, stamp_ns * 1e-9), 100)
+        assert sequence.place(block(60_000, 55.0), 100) == Arrival(1, 60_000, 0, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.samples import merging
 from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe, fit_clock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
@@ -64,7 +66,8 @@ def probe_blocks(
     ]
 
 
-def joined(blocks: list[AxisBlock]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def joined(found: Iterable[AxisBlock]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    blocks = list(found)
     values = {n: np.concatenate([getattr(b, n) for b in blocks]) for n in "xyzbc"}
     time = np.concatenate([b.stamp_ns * 1e-9 + np.arange(len(b)) * b.sample_period for b in blocks])
     return time, values
@@ -214,3 +217,38 @@ def test_counts_are_told_apart_to_the_highest_that_is_taken() -> None:
     np.testing.assert_allclose(found["z"], usual["z"], atol=0.5e-3 * 2 * np.pi * 6.0 / 4000)
     with pytest.raises(DataError, match="counter is corrupt"):
         replace(axes[0], first_sample=2**53)
+
+
+def as_a_bag_gives_them(blocks: list[AxisBlock] | list[DistanceBlock]) -> list[Block]:
+    """Messages that follow on as one block, which begins anew with each that does not."""
+    runs = [[blocks[0]]]
+    for block in blocks[1:]:
+        if block.first_sample == runs[-1][-1].end:
+            runs[-1].append(block)
+        else:
+            runs.append([block])
+    return [
+        replace(merging.joined(run), parts=np.array([(b.first_sample, b.stamp_ns) for b in run]))
+        for run in runs
+    ]
+
+
+def test_messages_that_a_bag_joins_are_moved_as_each_by_itself() -> None:
+    """Jitter, gaps, repeats, one that comes late, a device that begins anew."""
+    axes, probe = axis_blocks(jitter=2e-5), probe_blocks()
+    axes = axes[:20] + axes[21:30] + axes[28:]
+    probe = probe[:5] + probe[6:9] + [probe[5]] + probe[7:15]
+    again = [
+        replace(b, first_sample=b.first_sample - 50_000, stamp_ns=b.stamp_ns + 100_000)
+        for b in probe_blocks()[15:]
+    ]
+    expected = joined(axes_at_probe(axes, probe + again))
+    together = as_a_bag_gives_them(axes), as_a_bag_gives_them(probe + again)
+    assert len(together[0]) == 3
+    assert len(together[1]) == 5
+    found = list(axes_at_probe(*together))
+    assert np.concatenate([b.stamps for b in found])[:, 1].tolist() == [
+        b.stamp_ns for b in probe[:8] + probe[11:] + again
+    ]
+    for name, values in joined(found)[1].items():
+        assert values.tobytes() == expected[1][name].tobytes(), name
