@@ -5,7 +5,7 @@ Reads rosbag2 folders (sqlite3 and MCAP) and bare ``.mcap`` files.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -75,6 +75,8 @@ BLOCK_TOPICS = frozenset(_BLOCKS)
 # at 1 MB; beyond 8 MB only memory grows (processor time of 5 million points: 3.3 s at 1 MB, 2.7 s
 # at 8 MB, 2.7 s at 16 MB).
 _JOINED_BYTES = 8_000_000
+# Made once: for each of a million messages it would take longer than the test itself.
+_BYTES = bytes | memoryview
 # The year 2000, before any ROS: earlier stamps count from the start of a computer or of the twin.
 _CLOCK_SET_NS = 946_684_800 * 10**9
 
@@ -224,15 +226,17 @@ class BagReader:
         The blocks of a topic keep their order. Raises BagError as :meth:`records` does.
         """
         connections = [c for topic in topics for c in self._connections(topic)]
-        waiting: dict[str, list[bytes]] = {}
+        waiting: defaultdict[str, list[bytes]] = defaultdict(list)
         size = read = 0
         roles = self._roles(topics)
         for connection, _, raw in self._raw(connections):
-            waiting.setdefault(roles[connection.topic], []).append(raw)
-            size, read = size + len(raw), read + 1
+            waiting[roles[connection.topic]].append(raw)
+            size += len(raw)
+            read += 1
             if size >= _JOINED_BYTES:
                 yield from ((read, *item) for item in self._joined(waiting))
-                waiting, size = {}, 0
+                waiting.clear()
+                size = 0
         yield from ((read, *item) for item in self._joined(waiting))
 
     def _joined(self, waiting: Mapping[str, list[bytes]]) -> Iterator[tuple[str, Any]]:
@@ -271,7 +275,7 @@ class BagReader:
             if connections:
                 for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
                     promised -= 1
-                    if not isinstance(raw, bytes | memoryview):  # SQLite keeps any in any column
+                    if not isinstance(raw, _BYTES):  # SQLite keeps any in any column
                         raise BagError(
                             f"bag {str(self.path)!r}: a message is {shown(raw)}, no bytes: "
                             f"{DAMAGED}"

@@ -97,11 +97,18 @@ class RunningScatter:
 
     def _running(self, sizes: FloatArray) -> FloatArray:
         """Return the mean before any of ``sizes`` (n,) and after each of them, (n + 1,)."""
-        sums = []
-        fading = np.array([[1.0, 0.0, 0.0, 1.0, -self._decay, 0.0]])
-        for k, values in enumerate((sizes, np.ones(len(sizes)))):
-            state = np.array([[self._decay * self._sums[k], 0.0]])
-            after = sosfilt(fading, values, state)
-            sums.append(np.concatenate([[self._sums[k]], after]))
-            self._sums[k] = float(sums[k][-1])
+        sums = [self._faded(sizes, 0)]
+        if 1.0 + self._decay * self._sums[1] == self._sums[1]:
+            # As of some 50 000 samples one more does not change what all weigh together.
+            return np.asarray(sums[0] / self._sums[1], np.float64)
+        sums.append(self._faded(np.ones(len(sizes)), 1))
         return np.asarray(sums[0] / np.maximum(sums[1], np.finfo(np.float64).tiny), np.float64)
+
+    def _faded(self, values: FloatArray, k: int) -> FloatArray:
+        """Return the k-th fading sum before any of ``values`` (n,) and after each, (n + 1,)."""
+        state = np.array([[self._decay * self._sums[k], 0.0]])
+        sums = np.empty(len(values) + 1)
+        sums[0] = self._sums[k]
+        sosfilt(np.array([[1.0, 0.0, 0.0, 1.0, -self._decay, 0.0]]), values, state, sums[1:])
+        self._sums[k] = float(sums[-1])
+        return sums
