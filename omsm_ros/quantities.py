@@ -231,6 +231,7 @@ PLAY_RATE = Quantity("rate of playing", "", 0.0, 1e4, "1 = as recorded, 0 = as f
 PLAY_TIME = Quantity("time within a recording", "s", 0.0, 1e8, "give it in seconds")
 # A day of blocks of 0.1 s.
 QUEUE_DEPTH = Quantity("depth of a queue", "", 1, 1e6, "give a number of messages", whole=True)
+DOMAIN = Quantity("domain", "", 0, 232, "below 102 Linux leaves its ports to it", whole=True)
 LISTENERS = Quantity("listeners", "", 0, 1000, "0 = begin at once", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
 # Noise may make a latency a little negative, or more than a lag of next to nothing.

@@ -24,6 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from omsm_ros import quantities
 from omsm_ros.errors import (
     DEBUG,
     ConfigurationError,
@@ -77,6 +78,9 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
 
 
 def _init() -> None:
+    domain = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if domain.isdecimal():  # Fast DDS ends the process where there are no ports for it
+        quantities.DOMAIN.checked(int(domain[:20]), ConfigurationError, "ROS_DOMAIN_ID")
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except (

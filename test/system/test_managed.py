@@ -129,6 +129,14 @@ def start(node, *arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
+def test_a_domain_without_ports_is_named(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "500")
+    done = start("corrector")
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert "ROS_DOMAIN_ID is 500, expected a whole number from 0 to 232" in line
+
+
 @pytest.mark.parametrize(
     ("node", "arguments", "named"),
     [

@@ -7,6 +7,7 @@ response to the difference between the true past and that polynomial.
 
 from __future__ import annotations
 
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -89,7 +90,17 @@ def through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
 
 def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
     """Return the polynomial with which a section (6,) answers an everlasting one, ``motion``."""
-    degree = len(motion)
+    powers = _shifts(len(motion))
+    forward = sum(b * power for b, power in zip(section[:3], powers, strict=True))
+    if not section[4:].any():  # a delay, of which a long one has hundreds
+        return np.asarray(forward @ motion, np.float64)
+    backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
+    return np.asarray(np.linalg.solve(backward, forward @ motion), np.float64)
+
+
+@cache
+def _shifts(degree: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the matrices (degree, degree) that delay a polynomial by 0, 1 and 2 samples."""
     # q(k) -> q(k - 1) is a triangular matrix acting on the coefficients of q.
     shift = np.array(
         [
@@ -97,7 +108,4 @@ def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
             for i in range(degree)
         ]
     )
-    powers = (np.eye(degree), shift, shift @ shift)
-    forward = sum(b * power for b, power in zip(section[:3], powers, strict=True))
-    backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
-    return np.asarray(np.linalg.solve(backward, forward @ motion), np.float64)
+    return np.eye(degree), shift, shift @ shift

@@ -29,11 +29,8 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
 STAMP_TOLERANCE_S = 0.5
-# No stream waits for its partner so long: one of two heads further apart has no time of this world.
-_NO_WAIT_S = 3e7
-# What a head may cost of the other stream though all of that came later. After a clock was set back
-# it may be right; of a stamp that was wrong alone, the other stream would be lost from then on.
-_PATIENCE_S = 10.0
+# So many runs in a row that do not fit end the look for those that do.
+_MISSES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +194,16 @@ class Queue:
         while self._runs:
             self.drop(len(self._runs[0]))
 
+    def strays(self, other: Run) -> int:
+        """Return how many runs come before the newest ones of ``other``'s time; 0 without such."""
+        first = misses = 0
+        for place in range(len(self._runs) - 1, 0, -1):
+            misses = misses + 1 if _apart(self._runs[place], other) else 0
+            if misses == _MISSES:
+                break
+            first = first if misses else place
+        return first
+
     def _cut(self, samples: int) -> Run:
         run = self._runs[0]
         self.pending -= samples
@@ -229,9 +236,6 @@ class Pairing:
         self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
         self._link = _Link(-1, -1)
         self._held: deque[tuple[Run, Run]] = deque()
-        # A head that the other stream's could not be paired with, and what that cost so far [ns].
-        self._kept: Run | None = None
-        self._cost_ns = 0.0
 
     def pairs(self) -> Iterator[tuple[Run, Run]]:
         """Yield complete runs of axes and distance, of equal count and length."""
@@ -239,9 +243,8 @@ class Pairing:
             order = self._order(a, d)
             if order == 0:
                 yield from self._joined(a, d)
-            elif not self._linked(a, d) and self._stray(*((a, d) if order < 0 else (d, a))):
-                self.axes.drop(len(a))
-                self.distance.drop(len(d))
+            elif not self._linked(a, d) and _apart(a, d) and self._passes_strays(a, d):
+                continue
             elif order < 0:
                 samples = self._leading(a, d.first, a, d)
                 self.axes.drop(samples, _missing(a, self.distance))
@@ -282,17 +285,20 @@ class Pairing:
                 self.distance.settle(d, a.reasons)
                 yield a, d
 
-    def _stray(self, dropped: Run, kept: Run) -> bool:
-        """Return whether ``kept``, for which the other head is to be dropped, is no better."""
-        if self._kept is not kept:
-            self._kept, self._cost_ns = kept, 0.0
-        later_ns = dropped.stamp_ns - kept.stamp_ns
-        if later_ns > 0:
-            self._cost_ns += len(dropped) * dropped.period_ns
-        return (
-            abs(later_ns) > _NO_WAIT_S * NANOSECONDS_PER_S
-            or self._cost_ns > _PATIENCE_S * NANOSECONDS_PER_S
-        )
+    def _passes_strays(self, a: Run, d: Run) -> bool:
+        """Drop heads of a wrong time, where the other stream's goes with what comes after them.
+
+        Of a block whose stamp was wrong alone, nothing says so but the blocks that follow it: one
+        head would be taken for older, and the other stream dropped from then on.
+        """
+        axes, distance = self.axes.strays(d), self.distance.strays(a)
+        if bool(axes) == bool(distance):
+            return False
+        stream = self.axes if axes else self.distance
+        for _ in range(axes or distance):
+            assert stream.head is not None
+            stream.drop(len(stream.head))
+        return True
 
     def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
         """Return samples of ``run`` before the other head, all of them if the sessions differ."""

@@ -17,6 +17,8 @@ from omsm_ros.report.common import style
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLISECOND_S, NANOMETRE_M
 
 _LOWEST_HZ = 0.1
+# Of the logarithm of a gain: where nothing is known the band leaves the picture all the same.
+_WIDEST = 100.0
 _NM_PER_UM = MICROMETRE_M / NANOMETRE_M
 _SMALLEST_SHOWN_NM_PER_UM = 1e-4
 
@@ -61,7 +63,7 @@ def draw_gain(
 ) -> None:
     """Draw |G_m| with its 95 % band."""
     magnitude = np.abs(identified.dynamics.response(frequency))
-    band = np.exp(COVERAGE_FACTOR * _band(identified, frequency).gain)
+    band = np.exp(np.minimum(COVERAGE_FACTOR * _band(identified, frequency).gain, _WIDEST))
     _draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
     if true is not None:
         _draw_true(axes, frequency, np.abs(true.response(frequency)))
