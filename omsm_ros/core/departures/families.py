@@ -6,7 +6,7 @@ metres for errors of position, a share of the response for relaxations and modes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from numpy.polynomial import legendre
 from scipy import fft, signal
 
 from omsm_ros.core.departures.hysteresis import dahl, lost_in_gap, without_noise
+from omsm_ros.core.departures.term import Family, Term
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.steps import Steps, backlash_columns
@@ -32,7 +33,7 @@ _CREEPS_A_DECADE = 5
 # A line of damping ζ is 2ζ wide, and so far apart are neighbours.
 _DAMPINGS = (0.03, 0.15)
 # Faster modes are poles of the structure, which the choice of order finds.
-_FASTEST_MODE_HZ = 100.0
+FASTEST_MODE_HZ = 100.0
 # Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
 _SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
 # Values a sample at which a reversal is looked for: at 0.2 m/s² half a nanometre is missed.
@@ -52,46 +53,6 @@ _DRIFT_DEGREES = (2, 3, 4, 6, 8)
 _FEWEST_PERIODS = 2
 # Of vibration at a time: the next round looks for more.
 _LINES_TRIED = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Term:
-    """One departure from a linear, steady response.
-
-    parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
-    trials: how many independent ones its family tries, for the probability of the best
-    damping: of a mode, else 0
-    columns: (n, c), added to the reading per unit
-    """
-
-    family: str
-    parameter: float
-    trials: float
-    columns: FloatArray
-    damping: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Family:
-    """Terms of one kind, side by side: ``columns`` (n, terms · c)."""
-
-    name: str
-    parameters: FloatArray
-    trials: float
-    columns: FloatArray
-    dampings: FloatArray | None = None
-
-    @property
-    def width(self) -> int:
-        """Columns of one term."""
-        return int(self.columns.shape[1] // len(self.parameters))
-
-    def term(self, index: int) -> Term:
-        """Return the term at ``index``."""
-        part = slice(index * self.width, (index + 1) * self.width)
-        damping = 0.0 if self.dampings is None else float(self.dampings[index])
-        parameter = float(self.parameters[index])
-        return Term(self.name, parameter, self.trials, self.columns[:, part], damping)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +91,17 @@ class Departures:
                 return family.term(int(index))
         return term
 
+    def alike(self, family: Family) -> Family:
+        """Return the terms of ``family``, of the same record, as this fit has them."""
+        if family.name == CREEP:
+            return self.creep(family.parameters)
+        if family.name == MODE and family.dampings is not None:
+            pairs = zip(family.parameters.tolist(), family.dampings.tolist(), strict=True)
+            return self.modes(list(pairs))
+        if family.name == PERIODIC:
+            return self._of_periods(family.parameters, family.trials)
+        return next(f for f in self.families((family.name,)) if f.width == family.width)
+
     @property
     def duration(self) -> float:
         """Of the record [s]."""
@@ -153,41 +125,50 @@ class Departures:
         decades = np.log10(slowest / FASTEST_CREEP_S)
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
 
-    def creep(self) -> Family:
+    def creep(self, time_constants: FloatArray | None = None) -> Family:
         """Return ``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
 
         In time and from rest: a relaxation longer than the record remembers how it began.
         """
-        found, columns = self.time_constants(), []
+        found = self.time_constants() if time_constants is None else time_constants
         answer = self._in_time(self._answer)
-        for time_constant in found:
-            once = relaxed(answer, self.problem.period / time_constant)
-            columns += [once - answer, relaxed(once, self.problem.period / time_constant) - once]
-        return Family(CREEP, found, 3.0, np.column_stack(columns))
 
-    def modes(self) -> Family:
-        """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a."""
+        def part(first: int, last: int) -> FloatArray:
+            columns = []
+            for step in self.problem.period / found[first:last]:
+                once = relaxed(answer, step)
+                columns += [once - answer, relaxed(once, step) - once]
+            return np.array(columns).T
+
+        return Family(CREEP, found, 3.0, part, 2)
+
+    def modes(self, ladder: Sequence[tuple[float, float]] = ()) -> Family:
+        """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a.
+
+        ladder: frequencies [Hz] and dampings, if not all
+        """
+        found = ladder or self._ladder()
+
+        def part(first: int, last: int) -> FloatArray:
+            return np.concatenate([self.mode(*each).T for each in found[first:last]]).T
+
+        frequencies, dampings = np.array(found).T
+        return Family(MODE, frequencies, len(found) / 2, part, 2, dampings)
+
+    def _ladder(self) -> list[tuple[float, float]]:
         lowest = 2 / self.duration
-        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, _FASTEST_MODE_HZ)
-        ladder = [
+        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
+        return [
             (frequency, damping)
             for damping in _DAMPINGS
             for frequency in _geometric(lowest, max(highest, 2 * lowest), 2 * damping)
         ]
-        # Mode by mode: a long record's spectra of all would be a gigabyte.
-        rows = np.empty((2 * len(ladder), len(self.problem.input)))
-        for place, (frequency, damping) in enumerate(ladder):
-            rows[2 * place : 2 * place + 2] = self.mode(frequency, damping).T
-        frequencies, dampings = np.array(ladder).T
-        return Family(MODE, frequencies, len(ladder) / 2, rows.T, dampings)
 
     def mode(self, frequency: float, damping: float) -> FloatArray:
         """Return the columns (n, 2) of the mode at ``frequency`` [Hz], as in :meth:`modes`."""
         s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
         mode = self._answer / (1 + 2 * damping * s + s * s)
-        return np.column_stack(
-            [self._in_time(spectrum) for spectrum in (mode - self._answer, s * mode)]
-        )
+        return self._in_time(np.array([mode - self._answer, s * mode]))
 
     def vibration(self) -> Family:
         """Return the sine and cosine at the strongest lines of the residual."""
@@ -207,7 +188,7 @@ class Departures:
             power[max(peak - 8, 0) : peak + 9] = 0.0
         angles = 2 * np.pi * np.asarray(found) * time[:, np.newaxis]
         columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(samples, -1)
-        return Family(VIBRATION, np.asarray(found), samples / 2, columns)
+        return Family.of(VIBRATION, np.asarray(found), samples / 2, columns)
 
     def drift(self) -> Iterator[Family]:
         """Return polynomials of time beyond the first: slow drift, whatever the axis does."""
@@ -215,13 +196,13 @@ class Departures:
         columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
         for degree in _DRIFT_DEGREES:
             scale = np.full(1, self.duration / degree)
-            yield Family(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
+            yield Family.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
 
     def linearity(self) -> Family:
         """Return square and cube of the position in the travel: a probe that is not linear."""
         place = self._place
         columns = np.column_stack([place**2, place**3])
-        return Family(LINEARITY, np.zeros(1), 1.0, columns)
+        return Family.of(LINEARITY, np.zeros(1), 1.0, columns)
 
     @property
     def _place(self) -> FloatArray:
@@ -235,7 +216,7 @@ class Departures:
         deflection = answer / self.fitted.gain - self.problem.input
         deflection = deflection - np.median(deflection)
         largest = float(np.max(np.abs(deflection))) or 1.0
-        return Family(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
+        return Family.of(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
 
     def periodic(self, near: float | None = None) -> Family:
         """Return sines of the position, with periods from the whole travel to a fraction of it.
@@ -248,26 +229,35 @@ class Departures:
         trials = _OVERLAP * len(cycles)
         if near is not None:
             cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
-        angle = 2 * np.pi * answer / travel
-        # The cycles are evenly spaced, so each is the one before, turned by the same angle.
-        turned, step = np.exp(1j * cycles[0] * angle), np.exp(1j * (cycles[1] - cycles[0]) * angle)
-        rows = np.empty((2 * len(cycles), len(answer)))
-        for row in range(0, len(rows), 2):
-            rows[row], rows[row + 1] = turned.imag, turned.real
-            turned *= step
-        return Family(PERIODIC, np.asarray(travel / cycles), trials, rows.T)
+        return self._of_periods(travel / cycles, trials)
+
+    def _of_periods(self, periods: FloatArray, trials: float) -> Family:
+        """Return sines of the position of ``periods`` (k,) [m], evenly spaced in their inverse."""
+        angle = 2 * np.pi * self._in_time(self._answer) / self.fitted.gain
+        apart = 1 / periods[1] - 1 / periods[0]
+
+        def part(first: int, last: int) -> FloatArray:
+            # Each is the one before, turned by the same angle.
+            turned, step = np.exp(1j * angle / periods[first]), np.exp(1j * apart * angle)
+            rows = np.empty((2 * (last - first), len(angle)))
+            for row in range(0, len(rows), 2):
+                rows[row], rows[row + 1] = turned.imag, turned.real
+                turned *= step
+            return rows.T
+
+        return Family(PERIODIC, np.asarray(periods), trials, part, 2)
 
     def friction(self) -> Iterator[Family]:
         """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
         if not self.steps.edges:
             return
-        columns = [
-            c for travel in _SLIDING_TRAVELS_M for c in dahl(self._turning[::_FINER], travel)
-        ]
-        gain = self.fitted.gain
-        yield Family(
-            FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, -gain * np.column_stack(columns)
-        )
+
+        def part(first: int, last: int) -> FloatArray:
+            moved = self._turning[::_FINER]
+            columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl(moved, t)]
+            return -self.fitted.gain * np.column_stack(columns)
+
+        yield Family(FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, part, 2)
 
     @cached_property
     def _turning(self) -> FloatArray:
@@ -281,13 +271,17 @@ class Departures:
 
     def backlash(self) -> Iterator[Family]:
         """Return half of the backlash: by the last reversal, and by the last step."""
+
+        def part(first: int, last: int) -> FloatArray:
+            gaps = _GAPS_M[first:last]
+            lost = [c[::_FINER] for gap in gaps for c in lost_in_gap(self._turning, gap)]
+            return -self.fitted.gain * np.column_stack(lost)
+
         if self.steps.edges:
-            lost = [c[::_FINER] for gap in _GAPS_M for c in lost_in_gap(self._turning, gap)]
-            gain = self.fitted.gain
-            yield Family(BACKLASH, np.asarray(_GAPS_M), 2.0, -gain * np.column_stack(lost))
+            yield Family(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
         columns = backlash_columns(self.steps, len(self.problem.input))
         if columns.shape[1]:
-            yield Family(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+            yield Family.of(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
 
 
 def _vertex(power: FloatArray, peak: int) -> float:

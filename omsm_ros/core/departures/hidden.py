@@ -20,7 +20,6 @@ from omsm_ros.core.dynamics.response_band import relative_response_jacobian
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.least_squares import least_squares
 
 # Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
 # area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
@@ -91,7 +90,7 @@ def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm
     drift: columns of the background that model a drift
     """
     # Of relaxations alone: what the survey found of all else stands.
-    slow = with_slower_creep(survey)
+    slow = with_slower_creep(survey.thinned or survey)
     relaxations = [_hidden(slow, judged) for judged in slow.creep]
     for gone in _taken_for_noise(drift):
         other = without_drift(slow, gone).creep
@@ -256,8 +255,6 @@ def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArr
 
 def omitted(survey: Survey, column: FloatArray) -> FloatArray:
     """Return the shift (p,) of G's coefficients if a term that adds ``column`` (n,) is omitted."""
-    fitted, problem = survey.fitted, survey.problem
-    columns = problem.sensitivity(fitted)
-    solved = least_squares(columns, column[problem.used], 1e-9)
-    size = fitted.structure.size
-    return np.asarray(fitted.scaled.coefficient_jacobian(fitted.nonlinear) @ solved[:size])
+    fitted, solved = survey.fitted, survey.space.imitating(column)
+    jacobian = fitted.scaled.coefficient_jacobian(fitted.nonlinear)
+    return np.asarray(jacobian @ solved[: fitted.structure.size])

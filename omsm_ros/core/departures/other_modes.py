@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.departures.families import Term
 from omsm_ros.core.departures.hidden import omitted
 from omsm_ros.core.departures.survey import Survey
+from omsm_ros.core.departures.term import Term
 from omsm_ros.core.dynamics.response_band import relative_response_jacobian, response_band
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.output_error import Fit
@@ -48,17 +48,17 @@ def spread_of_modes(before: Survey, term: Term, fitted: Fit) -> FloatArray:
         for off in _FREQUENCIES
         if term.parameter * np.exp(off) < highest
     ]
-    columns = [before.departures.mode(*each) for each in tried]
-    screened = before.space.screen(np.column_stack(columns), 2)
+    before = before.thinned or before
+    modes = before.departures.modes(tried)
+    screened = before.screened(modes)
     likely = np.exp(0.5 * (screened - np.max(screened)))
     kept = np.flatnonzero(likely > _LEAST_LIKELY)
     lines = np.geomspace(_LOWEST_HZ, _HIGHEST * term.parameter, _LINES)
     lines = np.sort(np.append(lines, [frequency for frequency, _ in tried]))
-    own = _change(before, tried[0], columns[0], lines)
+    own = _change(before, modes.term(0), lines)
     rows = [
-        np.sqrt(likely[i] / np.sum(likely[kept]))
-        * (_change(before, tried[i], columns[i], lines) - own)
-        for i in kept
+        np.sqrt(likely[i] / np.sum(likely[kept])) * (_change(before, modes.term(i), lines) - own)
+        for i in kept.tolist()
     ]
     return _imitating(fitted, lines, np.asarray(rows))
 
@@ -89,14 +89,12 @@ def _imitating(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray
     return np.asarray(factor**2 * covariance)
 
 
-def _change(
-    before: Survey, which: tuple[float, float], columns: FloatArray, lines: FloatArray
-) -> ComplexArray:
-    """Return the relative change (k,) of G at ``lines`` [Hz] by the mode in its best size."""
-    (frequency, damping), size = which, before.space.score(columns).size
-    ratio = 1j * lines / frequency
-    mode = 1 / (1 + 2 * damping * ratio + ratio**2)
+def _change(before: Survey, term: Term, lines: FloatArray) -> ComplexArray:
+    """Return the relative change (k,) of G at ``lines`` [Hz] by a mode in its best size."""
+    size = before.space.score(term.columns).size
+    ratio = 1j * lines / term.parameter
+    mode = 1 / (1 + 2 * term.damping * ratio + ratio**2)
     real, imaginary = relative_response_jacobian(before.fitted.dynamics, lines) @ omitted(
-        before, columns @ size
+        before, term.columns @ size
     )
     return np.asarray(size[0] * (mode - 1) + size[1] * ratio * mode - real - 1j * imaginary)

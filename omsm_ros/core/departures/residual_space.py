@@ -15,9 +15,9 @@ from scipy import fft, stats
 
 from omsm_ros.core.fitting.covariance import noise_spectrum
 from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.fitting.uneven_noise import uneven_rows
+from omsm_ros.core.fitting.uneven_noise import scatter_in_time, uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
-from omsm_ros.least_squares import orthonormal
+from omsm_ros.least_squares import unit_columns
 
 # Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
 _IMITATED = 1e-4
@@ -63,7 +63,20 @@ class ResidualSpace:
 
     @cached_property
     def _basis(self) -> FloatArray:
-        return orthonormal(self.problem.sensitivity(self.fitted), _SPANNED)
+        return self._decomposed[0]
+
+    @cached_property
+    def _decomposed(self) -> tuple[FloatArray, FloatArray]:
+        """What the parameters can imitate: a basis (k, r), and its parameters (p, r)."""
+        unit, scale = unit_columns(self.problem.sensitivity(self.fitted))
+        left, values, right = np.linalg.svd(unit, full_matrices=False)
+        kept = values > _SPANNED * values[0]
+        return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
+
+    def imitating(self, column: FloatArray) -> FloatArray:
+        """Return the parameters (p,) that come nearest to ``column`` (n,) where it is compared."""
+        basis, parameters = self._decomposed
+        return np.asarray(parameters @ (basis.T @ column[self.problem.used]))
 
     def _compared(self, columns: FloatArray) -> FloatArray:
         """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
@@ -111,32 +124,47 @@ class ResidualSpace:
         if not np.any(free):
             return Score(size, covariance, 0.0, 0)
         unit = np.linalg.norm(freed[:, free], axis=0)
-        inverse = np.linalg.pinv(freed[:, free] / unit, rcond=_IMITATED)
-        found = inverse @ self.fitted.residual
-        residual = self.fitted.residual - freed[:, free] / unit @ found
-        spread = self._covariance(inverse, residual)
+        freed = freed[:, free] / unit
+        inverse, degrees = _pseudo_inverse(freed.T @ freed, _IMITATED**2)
+        found = inverse @ (freed.T @ self.fitted.residual)
+        spread = self._covariance(freed, inverse, found)
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
-        degrees = int(np.linalg.matrix_rank(inverse, tol=None))
         return Score(size, covariance, chi_square, degrees)
 
-    def _covariance(self, inverse: FloatArray, residual: FloatArray) -> FloatArray:
-        """Return the covariance (c, c) of ``inverse`` (c, k) times noise like ``residual`` (k,)."""
-        used = self.problem.used
-        length = fft.next_fast_len(len(used), real=True)
-        rows = np.zeros((len(inverse), len(used)))
-        rows[:, used] = inverse
-        spectrum = fft.rfft(rows, length, axis=1)
-        weight = np.full(spectrum.shape[1], 2.0)
-        weight[0] = 1.0
+    def _covariance(self, freed: FloatArray, inverse: FloatArray, found: FloatArray) -> FloatArray:
+        """Return the covariance (c, c) of ``found`` (c,), the sizes of ``freed`` (k, c).
+
+        That is of noise like what they leave of the residual, through ``inverse`` (c, c) freedᵀ.
+        """
+        samples = len(self.problem.used)
+        length = fft.next_fast_len(samples, real=True)
+        residual = self.fitted.residual - freed @ found
+        noise = broad_noise(residual, self._places, samples, length)
+        noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
+        noise[1:] *= 2.0
         if length % 2 == 0:
-            weight[-1] = 1.0
-        noise = broad_noise(residual, np.flatnonzero(used), len(used), length)
-        uneven = uneven_rows(self.problem, inverse.T, self.fitted.residual)
-        lost = self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-        from_noise = np.real((weight * noise * lost * spectrum) @ spectrum.conj().T) / length
-        return np.asarray(from_noise + uneven.T @ uneven)
+            noise[-1] *= 0.5
+        rows = np.zeros((freed.shape[1], samples))
+        rows[:, self.problem.used] = freed.T
+        spectrum = fft.rfft(rows, length, axis=1)
+        spectrum *= np.sqrt(noise / length)
+        parts = spectrum.view(np.float64)
+        uneven = uneven_rows(self.problem, freed, self._scatter)
+        return np.asarray(inverse @ (parts @ parts.T + uneven.T @ uneven) @ inverse.T)
+
+    @cached_property
+    def _scatter(self) -> float:
+        return scatter_in_time(self.problem, self.fitted.residual)
+
+
+def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:
+    """Return the inverse (c, c) of ``gram`` where it is not zero, and in how many directions."""
+    values, directions = np.linalg.eigh(gram)
+    kept = values > tolerance * values[-1]
+    strong = directions[:, kept]
+    return np.asarray(strong / values[kept] @ strong.T), int(np.sum(kept))
 
 
 def broad_noise(residual: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:

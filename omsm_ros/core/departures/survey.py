@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from omsm_ros.core.departures.families import PERIODIC, Departures, Family, Term
+from omsm_ros.core.departures.families import (
+    FASTEST_MODE_HZ,
+    PERIODIC,
+    VIBRATION,
+    Departures,
+)
 from omsm_ros.core.departures.residual_space import ResidualSpace, Score
-from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.departures.term import Family, Term
+from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated
+from omsm_ros.core.fitting.starting_points import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
 from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.samples.blocks import FloatArray
 
 # Probability of a false alarm of one family; ten of them together stay far below two per cent.
 FALSE_ALARM = 1e-4
@@ -19,6 +27,10 @@ FALSE_ALARM = 1e-4
 _LAGS = 25
 # A lagged rate weaker than this part of the strongest is rounding.
 _ABOVE_ROUNDING = 1e-6
+# Rows, and values of columns, that are in memory at a time.
+_ROWS, _VALUES = 65_536, 8_000_000
+# A step test rests for most of its time.
+_MOSTLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,25 +92,70 @@ class Survey:
         return found
 
     def _best_of(self, family: Family) -> Term:
-        screened = self.space.screen(family.columns, family.width)
-        return family.term(int(np.argmax(screened)))
+        if len(family.parameters) == 1:
+            return family.term(0)
+        if self.thinned is None or family.name == VIBRATION:
+            return family.term(int(np.argmax(self.screened(family))))
+        alike = self.thinned.departures.alike(family)
+        return family.term(int(np.argmax(self.thinned.screened(alike))))
+
+    def screened(self, family: Family) -> FloatArray:
+        """Return χ² of each term of ``family``, as for white noise, see :class:`ResidualSpace`."""
+        every = len(family.parameters)
+        step = max(_VALUES // (len(self.problem.input) * family.width), 1)
+        return np.concatenate(
+            [
+                self.space.screen(family.part(i, min(i + step, every)), family.width)
+                for i in range(0, every, step)
+            ]
+        )
+
+    @cached_property
+    def thinned(self) -> Survey | None:
+        """The same of fewer samples, of a long step test: what is slow shows there as well.
+
+        None where there are few samples, where the motion hardly rests, so that much of it may be
+        fast, or where rounding is shared by the readings of a plateau.
+        """
+        problem, steps = self.problem, self.steps
+        fastest = max(problem.rate / (2 * np.pi), FASTEST_MODE_HZ)
+        per_content = 0.5 / (problem.period * fastest * ABOVE_CONTENT)
+        every = int(min(len(problem.input) / ENOUGH_SAMPLES, per_content))
+        rests = bool(steps.edges) and float(np.mean(steps.moving)) < _MOSTLY
+        if every < 2 or not rests or problem.shared > 0:
+            return None
+        fewer = coarser(problem, every)
+        fitted = evaluated(fewer, self.fitted.structure, self.fitted.nonlinear)
+        # A step of the readings is one place in time whatever the samples.
+        moved = replace(steps, moving=steps.moving[::every])
+        return replace(self, problem=fewer, fitted=fitted, steps=moved)
 
     @cached_property
     def creep(self) -> tuple[Judged, ...]:
         """Return relaxations of every time constant that is looked for, each judged alone."""
         family = self.departures.creep()
-        terms = [family.term(index) for index in range(len(family.parameters))]
+        terms = (family.term(index) for index in range(len(family.parameters)))
         return tuple(Judged(t, self.space.score(t.columns[:, :1])) for t in terms)
 
     @cached_property
     def independence(self) -> float:
         """Return the probability that the residual follows the motion's rate by chance."""
-        rate = np.gradient(self.problem.input)
-        past = np.column_stack([np.roll(rate, lag) for lag in range(_LAGS)])
-        past[:_LAGS] = 0.0
-        left, values, _ = np.linalg.svd(past, full_matrices=False)
-        kept = values > _ABOVE_ROUNDING * values[0]
-        return float(np.exp(self.space.score(left[:, kept]).log_p)) if np.any(kept) else 1.0
+        rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.input)])
+        # The last values of the rate, the newest last; at the very first samples there are none.
+        past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
+        gram = np.zeros((_LAGS, _LAGS))
+        for first in range(0, len(past), _ROWS):
+            rows = np.ascontiguousarray(past[first : first + _ROWS])
+            gram += rows.T @ rows
+        powers, directions = np.linalg.eigh(gram)
+        kept = powers > _ABOVE_ROUNDING**2 * powers[-1]
+        if not np.any(kept):
+            return 1.0
+        mixed = directions[:, kept] / np.sqrt(powers[kept])
+        columns = np.empty((mixed.shape[1], len(past)))
+        for first in range(0, len(past), _ROWS):
+            columns[:, first : first + _ROWS] = (past[first : first + _ROWS] @ mixed).T
+        return float(np.exp(self.space.score(columns.T).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[Judged]:
         """Return the significant families, the clearest first, without those named ``but``."""

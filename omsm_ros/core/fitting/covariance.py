@@ -7,7 +7,7 @@ from scipy import fft
 
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.fitting.uneven_noise import uneven_rows
+from omsm_ros.core.fitting.uneven_noise import scatter_in_time, uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.least_squares import unit_columns
 
@@ -25,14 +25,14 @@ def autoregression(
     By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
     """
     n = len(residual)
-    size = fft.next_fast_len(2 * n, real=True)
-    power = np.abs(fft.rfft(residual, size)) ** 2
-    lags = fft.irfft(power, size)[: highest + 1] / n
+    highest = min(highest, n - 1)
+    lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
+    lags = np.array(lagged, np.float64) / n
     coefficients, variance = np.ones(1), float(lags[0])
     if variance <= 0:
         return coefficients, 0.0
     best = (n * np.log(variance), coefficients, variance)
-    for order in range(1, min(highest, n - 1) + 1):
+    for order in range(1, highest + 1):
         # Levinson's recursion.
         reflection = -(coefficients @ lags[order:0:-1]) / variance
         padded = np.append(coefficients, 0.0)
@@ -66,21 +66,21 @@ def parameter_covariance(
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))
-    on_grid = np.zeros((len(problem.used), size))
-    on_grid[problem.used] = columns
-    length = fft.next_fast_len(len(on_grid) + _MAX_NOISE_ORDER, real=True)
-    spectrum = fft.rfft(on_grid, length, axis=0)
-    weight = np.full(len(spectrum), 2.0)
-    weight[0] = 1.0
-    if length % 2 == 0:
-        weight[-1] = 1.0
+    length = fft.next_fast_len(len(problem.used) + _MAX_NOISE_ORDER, real=True)
     noise = noise_spectrum(residual, length)
     if passed is not None:
         came = _motion_noise_spectrum(problem, passed, length)
         noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
-    weighted = (weight * noise)[:, np.newaxis] * spectrum
-    uneven = uneven_rows(problem, columns, residual)
-    meat = np.real(np.conj(spectrum).T @ weighted) / length + uneven.T @ uneven
+    noise[1:] *= 2.0
+    if length % 2 == 0:
+        noise[-1] *= 0.5
+    on_grid = np.zeros((size, len(problem.used)))
+    on_grid[:, problem.used] = columns.T
+    spectrum = fft.rfft(on_grid, length, axis=1)
+    spectrum *= np.sqrt(noise / length)
+    parts = spectrum.view(np.float64)
+    uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
+    meat = parts @ parts.T + uneven.T @ uneven
     unit, scale = unit_columns(columns)
     values, directions = np.linalg.eigh(unit.T @ unit)
     least = _RANK_TOLERANCE * float(values[-1])

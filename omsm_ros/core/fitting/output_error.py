@@ -72,6 +72,10 @@ class Problem:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
         return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
 
+    def padded_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,) and nothing after them, at ``s``, shape (k,)."""
+        return np.asarray(fft.rfft(values, self.closed_length))[: len(self.s)]
+
     @cached_property
     def _spectrum(self) -> ComplexArray:
         moved = motion_spectrum(self.input, self.period, self.noise)
@@ -302,6 +306,15 @@ def fit(
             best, least = found, cost
     if best is None:
         raise ValueError("no start to fit from, expected one or more")
-    at = descend(project, best, box, evaluations)
+    return _fit_at(problem, scaled, descend(project, best, box, evaluations))
+
+
+def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
+    """Return ``structure`` at ψ as it is; only what enters linearly is fitted."""
+    scaled = problem.parametrised(structure)
+    return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
+
+
+def _fit_at(problem: Problem, scaled: Scaled, at: Projection) -> Fit:
     terms = len(at.linear) - problem.background.shape[1]
     return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)

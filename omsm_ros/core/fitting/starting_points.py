@@ -32,9 +32,12 @@ _LINEAR_ITERATIONS = 8
 # An added pole begins fast enough not to be seen, and slow enough to have a gradient.
 _ADDED_POLE = -10.0
 # Samples of a period; of two such a fit is started on one. A step test at 1 kHz has 20 000.
-_ENOUGH_SAMPLES = 20_000
+ENOUGH_SAMPLES = 20_000
 # Half the sampling rate of a coarse problem over the rate at which the motion has its content.
-_ABOVE_CONTENT = 1.25
+ABOVE_CONTENT = 1.25
+# Samples of the new rate on either side over which a low pass reaches, the middle of its edge over
+# the new half rate, and Kaiser's shape: at the new half rate it leaves 3e-5 of an amplitude.
+_HALF_TAPS, _PASSES, _STOPPING_SHAPE = 24, 0.88, 9.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +52,8 @@ class StartingPoints:
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
         """Return ψ of ``structure``, given the fits made so far."""
-        if self._coarser is not None and structure.poles:
-            coarse = self._coarser
+        if self.coarser is not None and structure.poles:
+            coarse = self.coarser
             return [fit(coarse.problem, structure, coarse.of(structure, smaller)).nonlinear]
         scaled = Scaled(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
@@ -64,11 +67,11 @@ class StartingPoints:
         return found
 
     @cached_property
-    def _coarser(self) -> StartingPoints | None:
+    def coarser(self) -> StartingPoints | None:
         """Those of the problem with fewer samples, if it has many more than its motion needs."""
         problem = self.problem
-        per_content = np.pi / (problem.rate * problem.period) / _ABOVE_CONTENT
-        every = int(min(problem.closed_length / _ENOUGH_SAMPLES, per_content))
+        per_content = np.pi / (problem.rate * problem.period) / ABOVE_CONTENT
+        every = int(min(problem.closed_length / ENOUGH_SAMPLES, per_content))
         return replace(self, problem=coarser(problem, every)) if every > 1 else None
 
     @cached_property
@@ -114,8 +117,13 @@ def coarser(problem: Problem, every: int) -> Problem:
     index = np.arange(len(problem.used))
     output = np.interp(index, index[problem.used], problem.output[problem.used])
 
+    # A light mode beyond the new half rate would fold to where the response is another.
+    low_pass = signal.firwin(
+        2 * _HALF_TAPS * every + 1, _PASSES / every, window=("kaiser", _STOPPING_SHAPE)
+    )
+
     def thinned(values: FloatArray) -> FloatArray:
-        return np.asarray(signal.resample_poly(values, 1, every, padtype="line"))
+        return np.asarray(signal.resample_poly(values, 1, every, window=low_pass, padtype="line"))
 
     return replace(
         problem,

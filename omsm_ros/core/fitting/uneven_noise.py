@@ -9,13 +9,13 @@ from omsm_ros.core.fitting.timing_noise import timing_variance
 from omsm_ros.core.samples.blocks import FloatArray
 
 
-def uneven_rows(problem: Problem, columns: FloatArray, residual: FloatArray) -> FloatArray:
+def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatArray:
     """Return what errors beside even noise make of ``columns`` (k, c), an independent error a row.
 
     Each row is that of one standard deviation, so that with rows E their covariance is EᵀE.
-    residual: (k,) of the fit, which shows how readings scatter in time
+    scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
-    return np.concatenate([_rounded(problem, columns), _late(problem, columns, residual)])
+    return np.concatenate([_rounded(problem, columns), _late(problem, columns, scatter)])
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
@@ -48,8 +48,7 @@ def _rounded(problem: Problem, columns: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
 
 
-def _late(problem: Problem, columns: FloatArray, residual: FloatArray) -> FloatArray:
-    variance = scatter_in_time(problem, residual)
+def _late(problem: Problem, columns: FloatArray, variance: float) -> FloatArray:
     if variance == 0:
         return np.zeros((0, columns.shape[1]))
     rate = rate_of(problem)[problem.used, np.newaxis]

@@ -20,9 +20,9 @@ from omsm_ros.core.departures.families import (
     PERIODIC,
     STIFFENING,
     VIBRATION,
-    Term,
 )
 from omsm_ros.core.departures.survey import FALSE_ALARM, Judged
+from omsm_ros.core.departures.term import Term
 from omsm_ros.core.dynamics.frequency_response import frequency_response
 from omsm_ros.core.fitting.covariance import parameter_covariance
 from omsm_ros.core.fitting.output_error import Fit, Problem

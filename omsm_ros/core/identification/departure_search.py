@@ -22,9 +22,9 @@ from omsm_ros.core.departures.families import (
     MODE,
     PERIODIC,
     VIBRATION,
-    Term,
 )
 from omsm_ros.core.departures.survey import Judged, Survey
+from omsm_ros.core.departures.term import Term
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information

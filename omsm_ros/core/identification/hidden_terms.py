@@ -13,10 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from omsm_ros.core.departures.families import CREEP, MODE, Term
+from omsm_ros.core.departures.families import CREEP, MODE
 from omsm_ros.core.departures.hidden import HiddenTerm, hidden_terms, with_slower_creep
 from omsm_ros.core.departures.other_modes import spread_of_modes
 from omsm_ros.core.departures.survey import Survey
+from omsm_ros.core.departures.term import Term
 from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm

@@ -9,11 +9,23 @@ import numpy as np
 
 from omsm_ros.core.fitting.initial_condition import starts_ringing
 from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_choice import Candidate, choose, explore, identifiable
-from omsm_ros.core.fitting.output_error import Fit, Problem, fit
+from omsm_ros.core.fitting.order_choice import (
+    Candidate,
+    choose,
+    explore,
+    identifiable,
+    information,
+)
+from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.fitting.starting_points import StartingPoints
-from omsm_ros.core.identification.residual_tests import noise_colour
+from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
+
+# Of what is worse by so much on fewer samples none is chosen on all of them; a structure is chosen
+# within one parameter of the best, at 14 at most.
+_MAY_BE_CHOSEN_BIC = 30.0
+# Probability by chance below which what moves faster than fewer samples show tells more.
+_NOTHING_BEYOND = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +48,70 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     points = StartingPoints(problem, lag)
+    if points.coarser is not None:
+        model = _chosen_on_fewer(prepared, points.coarser, lag, order)
+        if follows_beyond(problem, model.chosen.fit, points.coarser.problem) > _NOTHING_BEYOND:
+            return model
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
     colour = noise_colour(problem, lag, prepared.steps)
-    explored = explore(fit_structure, order, colour, problem.effort)
+    return _model(problem, explore(fit_structure, order, colour, problem.effort), order)
+
+
+def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Model:
     candidates = _identifiable(problem, explored)
     free = Model(choose(candidates), candidates)
     if not order:
         return free
     asked = [c for c in explored if c.fit.structure.poles == order]
     return Model(choose(asked), asked, free)
+
+
+def _chosen_on_fewer(prepared: Prepared, points: StartingPoints, lag: Fit, order: int) -> Model:
+    """Explore structures at the samples of ``points``; fit to all those that may be chosen.
+
+    lag: the fit of a delay alone to all samples
+    A structure that is far from the best there is compared with all samples where it was best.
+    """
+    problem, coarse = prepared.problem, points.problem
+    every = round(coarse.period / problem.period)
+    steps = replace(prepared.steps, moving=prepared.steps.moving[::every])
+    fewer = replace(points, pure_delay=fit(coarse, lag.structure, [lag.nonlinear]))
+
+    def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
+        return fit(coarse, structure, fewer.of(structure, smaller))
+
+    colour = noise_colour(coarse, fewer.pure_delay, steps)
+    found = explore(fit_structure, order, colour, problem.effort)
+    best = min(c.bic for c in found)
+    price = noise_colour(problem, lag, prepared.steps)
+
+    def candidate(fitted: Fit) -> Candidate:
+        return Candidate(fitted, information(fitted, price))
+
+    explored = [
+        candidate(
+            fit(problem, c.fit.structure, [c.fit.nonlinear])
+            if c.bic < best + _MAY_BE_CHOSEN_BIC
+            else evaluated(problem, c.fit.structure, c.fit.nonlinear)
+        )
+        for c in found
+    ]
+    finished = {c.fit.structure for c in found if c.bic < best + _MAY_BE_CHOSEN_BIC}
+    while True:
+        model = _model(problem, explored, order)
+        chosen = {m.chosen.fit.structure for m in (model, model.free) if m is not None}
+        if chosen <= finished:
+            return model
+        explored = [
+            candidate(fit(problem, c.fit.structure, [c.fit.nonlinear]))
+            if c.fit.structure in chosen - finished
+            else c
+            for c in explored
+        ]
+        finished |= chosen
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:

@@ -17,9 +17,9 @@ from omsm_ros.core.departures.families import (
     STIFFENING,
     VIBRATION,
     Departures,
-    Family,
     relaxed,
 )
+from omsm_ros.core.departures.term import Family
 from omsm_ros.core.fitting.steps import Steps
 
 
@@ -255,7 +255,8 @@ class TestWhichFamilies:
 
 def test_a_family_gives_its_terms_with_their_own_columns():
     columns = np.arange(12.0).reshape(2, 6)
-    family = Family("some", np.array([5.0, 7.0, 9.0]), 2.5, columns, np.array([0.1, 0.2, 0.3]))
+    made = Family.of("some", np.array([5.0, 7.0, 9.0]), 2.5, columns)
+    family = replace(made, dampings=np.array([0.1, 0.2, 0.3]))
     term = family.term(1)
     assert (family.width, term.parameter, term.damping, term.trials) == (2, 7.0, 0.2, 2.5)
     np.testing.assert_array_equal(term.columns, [[2.0, 3.0], [8.0, 9.0]])
