@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, stats
 
-from omsm_ros.core.fitting.covariance import noise_spectrum
+from omsm_ros.core.fitting.covariance import noise_spectrum, weighted_gram
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.uneven_noise import scatter_in_time, uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
@@ -23,6 +23,8 @@ from omsm_ros.least_squares import unit_columns
 _IMITATED = 1e-4
 # Directions this much weaker than the strongest are rounding.
 _SPANNED = 1e-9
+# That are in memory at a time beside the result.
+_SAMPLES = 65_536
 # Noise is averaged over at least this many lines: its level is then known to a quarter.
 _LEAST_LINES = 8
 # and over half an octave on either side where the lines are dense.
@@ -83,7 +85,8 @@ class ResidualSpace:
         first, last = self._places[0], self._places[-1]
         if last - first < len(self._places):
             # Without a gap there is nothing to pick.
-            return np.ascontiguousarray(columns.T[:, first : last + 1]).T
+            rows = columns.T[:, first : last + 1]
+            return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
         return np.take(columns.T, self._places, axis=1).T
 
     @cached_property
@@ -116,43 +119,55 @@ class ResidualSpace:
     def score(self, columns: FloatArray) -> Score:
         """Judge the term of ``columns`` (n, c), all its coefficients together."""
         compared = self._compared(columns)
-        freed = self.freed(columns)
         before = np.linalg.norm(compared, axis=0)
-        free = np.linalg.norm(freed, axis=0) > _IMITATED * np.where(before > 0, before, 1.0)
+        rows = self._freed_rows(compared)
+        unit = np.linalg.norm(rows, axis=1)
+        free = unit > _IMITATED * np.where(before > 0, before, 1.0)
         terms = columns.shape[1]
         size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
         if not np.any(free):
             return Score(size, covariance, 0.0, 0)
-        unit = np.linalg.norm(freed[:, free], axis=0)
-        freed = freed[:, free] / unit
-        inverse, degrees = _pseudo_inverse(freed.T @ freed, _IMITATED**2)
-        found = inverse @ (freed.T @ self.fitted.residual)
-        spread = self._covariance(freed, inverse, found)
+        rows, unit = rows[free] if not np.all(free) else rows, unit[free]
+        rows /= unit[:, np.newaxis]
+        inverse, degrees = _pseudo_inverse(rows @ rows.T, _IMITATED**2)
+        found = inverse @ (rows @ self._residual)
+        spread = inverse @ self._noise_of(rows, found) @ inverse.T
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
         return Score(size, covariance, chi_square, degrees)
 
-    def _covariance(self, freed: FloatArray, inverse: FloatArray, found: FloatArray) -> FloatArray:
-        """Return the covariance (c, c) of ``found`` (c,), the sizes of ``freed`` (k, c).
+    @cached_property
+    def _residual(self) -> FloatArray:
+        return self.problem.on_grid(self.fitted.residual, 0.0)
 
-        That is of noise like what they leave of the residual, through ``inverse`` (c, c) freedᵀ.
+    def _freed_rows(self, compared: FloatArray) -> FloatArray:
+        """Return ``compared`` (k, c) less what the fit can imitate, (c, n), 0 elsewhere."""
+        rows, imitated = (
+            np.zeros((compared.shape[1], len(self.problem.used))),
+            compared.T @ self._basis,
+        )
+        for first in range(0, len(compared), _SAMPLES):
+            part = slice(first, first + _SAMPLES)
+            rows[:, self._places[part]] = compared[part].T - imitated @ self._basis[part].T
+        return rows
+
+    def _noise_of(self, rows: FloatArray, found: FloatArray) -> FloatArray:
+        """Return the covariance (c, c) of noise times ``rows`` (c, n).
+
+        The noise is like what ``rows``, ``found`` (c,) times, leave of the residual.
         """
-        samples = len(self.problem.used)
+        used = self.problem.used
+        samples = len(used)
         length = fft.next_fast_len(samples, real=True)
-        residual = self.fitted.residual - freed @ found
+        residual = (self._residual - found @ rows)[used]
         noise = broad_noise(residual, self._places, samples, length)
         noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-        noise[1:] *= 2.0
-        if length % 2 == 0:
-            noise[-1] *= 0.5
-        rows = np.zeros((freed.shape[1], samples))
-        rows[:, self.problem.used] = freed.T
-        spectrum = fft.rfft(rows, length, axis=1)
-        spectrum *= np.sqrt(noise / length)
-        parts = spectrum.view(np.float64)
-        uneven = uneven_rows(self.problem, freed, self._scatter)
-        return np.asarray(inverse @ (parts @ parts.T + uneven.T @ uneven) @ inverse.T)
+        even = weighted_gram(rows, length, noise)
+        if self._scatter == 0 and self.problem.shared == 0:
+            return even
+        uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
+        return np.asarray(even + uneven.T @ uneven)
 
     @cached_property
     def _scatter(self) -> float:

@@ -28,13 +28,14 @@ def autoregression(
     highest = min(highest, n - 1)
     lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
     lags = np.array(lagged, np.float64) / n
-    coefficients, variance = np.ones(1), float(lags[0])
+    coefficients: FloatArray = np.ones(1)
+    variance = float(lags[0])
     if variance <= 0:
         return coefficients, 0.0
     best = (n * np.log(variance), coefficients, variance)
     for order in range(1, highest + 1):
         # Levinson's recursion.
-        reflection = -(coefficients @ lags[order:0:-1]) / variance
+        reflection = -float(coefficients @ lags[order:0:-1]) / variance
         padded = np.append(coefficients, 0.0)
         coefficients = padded + reflection * padded[::-1]
         variance *= 1 - reflection**2
@@ -48,6 +49,23 @@ def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
     """Return the variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies."""
     coefficients, variance = autoregression(residual)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
+
+
+def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:
+    """Return the covariance (c, c) of ``rows`` (c, n) times noise of a variance spectrum.
+
+    noise: (``length`` // 2 + 1,), at the frequencies of a transform of ``length``
+    """
+    weight = 2.0 * noise / length
+    weight[0] *= 0.5
+    if length % 2 == 0:
+        weight[-1] *= 0.5
+    weight = np.sqrt(weight)
+    # Row by row: of a long record all at once take as much memory again.
+    parts = np.empty((len(rows), 2 * len(weight)))
+    for row, part in zip(rows, parts, strict=True):
+        part[:] = (weight * fft.rfft(row, length)).view(np.float64)
+    return np.asarray(parts @ parts.T)
 
 
 def parameter_covariance(
@@ -71,16 +89,10 @@ def parameter_covariance(
     if passed is not None:
         came = _motion_noise_spectrum(problem, passed, length)
         noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
-    noise[1:] *= 2.0
-    if length % 2 == 0:
-        noise[-1] *= 0.5
     on_grid = np.zeros((size, len(problem.used)))
     on_grid[:, problem.used] = columns.T
-    spectrum = fft.rfft(on_grid, length, axis=1)
-    spectrum *= np.sqrt(noise / length)
-    parts = spectrum.view(np.float64)
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
-    meat = parts @ parts.T + uneven.T @ uneven
+    meat = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
     unit, scale = unit_columns(columns)
     values, directions = np.linalg.eigh(unit.T @ unit)
     least = _RANK_TOLERANCE * float(values[-1])

@@ -30,6 +30,8 @@ from omsm_ros.least_squares import least_squares
 _RANK_TOLERANCE = 1e-12
 # Columns that LAPACK takes at a time.
 _BLOCK = 32
+# Of columns that are in memory at a time beside the result.
+_VALUES = 4_000_000
 # Of each start; held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
 # A bound for fits that creep along a valley; others end by convergence before.
@@ -128,8 +130,15 @@ class Problem:
     def _fixed(self) -> FloatArray:
         return self.background[self.used]
 
-    def _in_time(self, spectrum: ComplexArray) -> FloatArray:
-        return np.take(fft.irfft(spectrum, self.closed_length, axis=-1), self._places, axis=-1)
+    def _in_time(self, spectra: ComplexArray) -> FloatArray:
+        found = np.empty((len(spectra), len(self._places)))
+        # All at once take a long record's memory again.
+        step = max(_VALUES // self.closed_length, 1)
+        for first in range(0, len(spectra), step):
+            part = slice(first, first + step)
+            values = fft.irfft(spectra[part], self.closed_length, axis=-1)
+            np.take(values, self._places, axis=-1, out=found[part])
+        return found
 
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
