@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+# Of columns that are factorised at a time.
+_ROWS = 65_536
 
 
 def unit_columns(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -33,3 +35,15 @@ def orthonormal(columns: FloatArray, tolerance: float) -> FloatArray:
     """
     left, values, _ = np.linalg.svd(unit_columns(columns)[0], full_matrices=False)
     return np.asarray(left[:, values > tolerance * values[0]])
+
+
+def triangle(*parts: FloatArray) -> FloatArray:
+    """Return R (q, q) of the columns of all ``parts`` (n, …), side by side, without making Q.
+
+    Block by block, so that a long record's columns are never in memory twice.
+    """
+    found = np.zeros((0, sum(part.shape[1] for part in parts)))
+    for first in range(0, len(parts[0]), _ROWS):
+        block = np.column_stack([part[first : first + _ROWS] for part in parts])
+        found = np.linalg.qr(np.concatenate([found, block]), mode="r")
+    return np.asarray(found)

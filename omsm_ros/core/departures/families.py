@@ -252,14 +252,14 @@ class Departures:
         if not self.steps.edges:
             return
 
+        moved = self._turning()[::_FINER].copy()
+
         def part(first: int, last: int) -> FloatArray:
-            moved = self._turning[::_FINER]
             columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl(moved, t)]
             return -self.fitted.gain * np.column_stack(columns)
 
         yield Family(FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, part, 2)
 
-    @cached_property
     def _turning(self) -> FloatArray:
         """Return the position of the structure, ``_FINER`` values a sample.
 
@@ -273,8 +273,8 @@ class Departures:
         """Return half of the backlash: by the last reversal, and by the last step."""
 
         def part(first: int, last: int) -> FloatArray:
-            gaps = _GAPS_M[first:last]
-            lost = [c[::_FINER] for gap in gaps for c in lost_in_gap(self._turning, gap)]
+            gaps, moved = _GAPS_M[first:last], self._turning()
+            lost = [c[::_FINER] for gap in gaps for c in lost_in_gap(moved, gap)]
             return -self.fitted.gain * np.column_stack(lost)
 
         if self.steps.edges:

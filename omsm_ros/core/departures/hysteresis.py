@@ -26,14 +26,19 @@ def through_gap(motion: FloatArray, half: float) -> FloatArray:
     if len(moved) == 0:
         return motion.copy()
     # Along a run of one direction only its end counts.
-    turns = moved[np.flatnonzero(np.diff(np.sign(change[moved])))]
+    back = change[moved] < 0
+    turns = moved[np.flatnonzero(back[1:] != back[:-1])]
+    del change, moved  # of a long record, memory for what follows
     ends = np.append(turns, len(motion) - 1)
     state, states = float(motion[0]), []
     for end in motion[ends].tolist():
         states.append(state)
         state = min(max(state, end - half), end + half)
     held = np.repeat(states, np.diff(ends, prepend=-1))
-    return np.asarray(np.clip(held, motion - half, motion + half))
+    near = motion - half
+    np.maximum(held, near, out=held)
+    near += 2 * half
+    return np.asarray(np.minimum(held, near, out=held))
 
 
 def lost_in_gap(motion: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:

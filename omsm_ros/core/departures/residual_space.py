@@ -95,8 +95,19 @@ class ResidualSpace:
 
     def freed(self, columns: FloatArray) -> FloatArray:
         """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
-        compared = self._compared(columns)
-        return np.asarray(compared - self._basis @ (self._basis.T @ compared))
+        rows = columns.T.copy()
+        self._free(rows)
+        return np.asarray(rows[:, self.problem.used].T)
+
+    def _free(self, rows: FloatArray) -> None:
+        """Take from ``rows`` (c, n) what is not compared, and what the fit can imitate."""
+        rows[:, ~self.problem.used] = 0.0
+        parts = [slice(i, i + _SAMPLES) for i in range(0, len(self._places), _SAMPLES)]
+        imitated = np.zeros((len(rows), self._basis.shape[1]))
+        for part in parts:
+            imitated += rows[:, self._places[part]] @ self._basis[part]
+        for part in parts:
+            rows[:, self._places[part]] -= imitated @ self._basis[part].T
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
         """Return χ² of each group of ``terms`` neighbouring columns of (n, c), as for white noise.
@@ -118,12 +129,16 @@ class ResidualSpace:
 
     def score(self, columns: FloatArray) -> Score:
         """Judge the term of ``columns`` (n, c), all its coefficients together."""
-        compared = self._compared(columns)
-        before = np.linalg.norm(compared, axis=0)
-        rows = self._freed_rows(compared)
-        unit = np.linalg.norm(rows, axis=1)
+        return self.judged(columns.T.copy())
+
+    def judged(self, rows: FloatArray) -> Score:
+        """Judge the term of ``rows`` (c, n), its columns, which are overwritten."""
+        rows[:, ~self.problem.used] = 0.0
+        before = _lengths(rows)
+        self._free(rows)
+        unit = _lengths(rows)
         free = unit > _IMITATED * np.where(before > 0, before, 1.0)
-        terms = columns.shape[1]
+        terms = len(rows)
         size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
         if not np.any(free):
             return Score(size, covariance, 0.0, 0)
@@ -140,17 +155,6 @@ class ResidualSpace:
     @cached_property
     def _residual(self) -> FloatArray:
         return self.problem.on_grid(self.fitted.residual, 0.0)
-
-    def _freed_rows(self, compared: FloatArray) -> FloatArray:
-        """Return ``compared`` (k, c) less what the fit can imitate, (c, n), 0 elsewhere."""
-        rows, imitated = (
-            np.zeros((compared.shape[1], len(self.problem.used))),
-            compared.T @ self._basis,
-        )
-        for first in range(0, len(compared), _SAMPLES):
-            part = slice(first, first + _SAMPLES)
-            rows[:, self._places[part]] = compared[part].T - imitated @ self._basis[part].T
-        return rows
 
     def _noise_of(self, rows: FloatArray, found: FloatArray) -> FloatArray:
         """Return the covariance (c, c) of noise times ``rows`` (c, n).
@@ -172,6 +176,11 @@ class ResidualSpace:
     @cached_property
     def _scatter(self) -> float:
         return scatter_in_time(self.problem, self.fitted.residual)
+
+
+def _lengths(rows: FloatArray) -> FloatArray:
+    """Return the lengths (c,) of ``rows`` (c, n); numpy's norm takes their memory again."""
+    return np.asarray(np.sqrt(np.einsum("cn,cn->c", rows, rows)))
 
 
 def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:

@@ -155,7 +155,7 @@ class Survey:
         columns = np.empty((mixed.shape[1], len(past)))
         for first in range(0, len(past), _ROWS):
             columns[:, first : first + _ROWS] = (past[first : first + _ROWS] @ mixed).T
-        return float(np.exp(self.space.score(columns.T).log_p))
+        return float(np.exp(self.space.judged(columns).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[Judged]:
         """Return the significant families, the clearest first, without those named ``but``."""

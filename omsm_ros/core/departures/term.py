@@ -47,7 +47,8 @@ class Family:
         width = int(columns.shape[1] // len(parameters))
 
         def part(first: int, last: int) -> FloatArray:
-            return columns[:, first * width : last * width]
+            # A copy: a term outlives its family, and a view would keep all of that.
+            return columns.T[first * width : last * width].copy().T
 
         return cls(name, parameters, trials, part, width)
 

@@ -13,6 +13,8 @@ from omsm_ros.least_squares import unit_columns
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
+# Of transforms that are in memory at a time.
+_VALUES = 4_000_000
 # Directions of the parameter space this much weaker than the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11
 
@@ -61,11 +63,24 @@ def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArra
     if length % 2 == 0:
         weight[-1] *= 0.5
     weight = np.sqrt(weight)
-    # Row by row: of a long record all at once take as much memory again.
-    parts = np.empty((len(rows), 2 * len(weight)))
-    for row, part in zip(rows, parts, strict=True):
-        part[:] = (weight * fft.rfft(row, length)).view(np.float64)
-    return np.asarray(parts @ parts.T)
+
+    def parts(block: slice) -> FloatArray:
+        found = np.empty((len(rows[block]), 2 * len(weight)))
+        for row, part in zip(rows[block], found, strict=True):
+            part[:] = (weight * fft.rfft(row, length)).view(np.float64)
+        return found
+
+    # Of a long record not all at once: that takes as much memory again.
+    step = max(_VALUES // length, 1)
+    blocks = [slice(first, first + step) for first in range(0, len(rows), step)]
+    gram = np.empty((len(rows), len(rows)))
+    for i, block in enumerate(blocks):
+        mine = parts(block)
+        gram[block, block] = mine @ mine.T
+        for other in blocks[:i]:
+            gram[block, other] = mine @ parts(other).T
+            gram[other, block] = gram[block, other].T
+    return gram
 
 
 def parameter_covariance(

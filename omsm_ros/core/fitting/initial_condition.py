@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.least_squares import orthonormal
+from omsm_ros.least_squares import triangle
 
 # χ² a column must explain to be taken: four sigma.
 _CLEARLY_SHOWN = 16.0
@@ -39,8 +39,13 @@ def starts_ringing(
     columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit has already taken of a decay what the parameters of the model can imitate.
     known = problem.sensitivity(fitted)
-    basis = orthonormal(np.column_stack([columns, known]), _SPANNED)
-    explained = float(np.sum((basis.T @ fitted.residual) ** 2))
+    lengths = [np.sqrt(np.einsum("kq,kq->q", part, part)) for part in (columns, known)]
+    scale = np.concatenate([*lengths, np.ones(1)])
+    scale[scale == 0] = 1.0
+    factor = triangle(columns, known, fitted.residual[:, np.newaxis]) / scale
+    left, values, _ = np.linalg.svd(factor[:-1, :-1])
+    spanned = left[:, values > _SPANNED * values[0]]
+    explained = float(np.sum((spanned.T @ factor[:-1, -1]) ** 2))
     rest = fitted.sum_of_squares - explained
-    size = basis.shape[1] - known.shape[1]
+    size = spanned.shape[1] - known.shape[1]
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)

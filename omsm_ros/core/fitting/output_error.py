@@ -220,8 +220,18 @@ class Problem:
         slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
         by_nonlinear = slopes * (fitted.driven @ driven)
         by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
-        moved = self._in_time(np.concatenate([by_numerator, by_nonlinear, by_gain, driven[terms:]]))
-        return np.column_stack([moved.T, self._fixed])
+        return self._beside_background([by_numerator, by_nonlinear, by_gain, driven[terms:]])
+
+    def _beside_background(self, spectra: Sequence[ComplexArray]) -> FloatArray:
+        """Return columns (k, …) of all ``spectra`` (…, k), then those of the background."""
+        count = sum(map(len, spectra))
+        rows = np.empty((count + self.background.shape[1], len(self._places)))
+        rows[count:] = self._fixed.T
+        first = 0
+        for part in spectra:
+            rows[first : first + len(part)] = self._in_time(part)
+            first += len(part)
+        return rows.T
 
     def bent(self, fitted: Fit) -> FloatArray:
         """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
@@ -232,8 +242,7 @@ class Problem:
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
-        moved = self._in_time(np.concatenate([bends, driven[terms:]]))
-        return np.column_stack([moved.T, self._fixed])
+        return self._beside_background([bends, driven[terms:]])
 
 
 @dataclass(frozen=True, eq=False)

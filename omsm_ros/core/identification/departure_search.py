@@ -157,6 +157,7 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
         return []
     survey = Survey(prepared.problem, best, prepared.steps, _BESIDE)
     columns = _beside(survey, survey.significant())
+    del survey  # of a long record, memory for the fit
     if not columns:
         return []
     problem = _with_columns(prepared, columns)[0].problem

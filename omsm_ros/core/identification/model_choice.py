@@ -24,6 +24,8 @@ from omsm_ros.core.identification.residual_tests import follows_beyond, noise_co
 # Of what is worse by so much on fewer samples none is chosen on all of them; a structure is chosen
 # within one parameter of the best, at 14 at most.
 _MAY_BE_CHOSEN_BIC = 30.0
+# Beyond the first ones, of a fit that starts at the minimum over fewer samples.
+_NEARLY_EVALUATIONS = 2
 # Probability by chance below which what moves faster than fewer samples show tells more.
 _NOTHING_BEYOND = 0.01
 
@@ -93,13 +95,13 @@ def _chosen_on_fewer(prepared: Prepared, points: StartingPoints, lag: Fit, order
 
     explored = [
         candidate(
-            fit(problem, c.fit.structure, [c.fit.nonlinear])
+            fit(problem, c.fit.structure, [c.fit.nonlinear], _NEARLY_EVALUATIONS)
             if c.bic < best + _MAY_BE_CHOSEN_BIC
             else evaluated(problem, c.fit.structure, c.fit.nonlinear)
         )
         for c in found
     ]
-    finished = {c.fit.structure for c in found if c.bic < best + _MAY_BE_CHOSEN_BIC}
+    finished: set[Structure] = set()
     while True:
         model = _model(problem, explored, order)
         chosen = {m.chosen.fit.structure for m in (model, model.free) if m is not None}
