@@ -18,7 +18,7 @@ from omsm_ros.core.departures.residual_space import ResidualSpace, Score
 from omsm_ros.core.departures.term import Family, Term
 from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated
 from omsm_ros.core.fitting.starting_points import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
-from omsm_ros.core.fitting.steps import Steps
+from omsm_ros.core.fitting.steps import Edge, Steps
 from omsm_ros.core.samples.blocks import FloatArray
 
 # Probability of a false alarm of one family; ten of them together stay far below two per cent.
@@ -126,8 +126,10 @@ class Survey:
             return None
         fewer = coarser(problem, every)
         fitted = evaluated(fewer, self.fitted.structure, self.fitted.nonlinear)
-        # A step of the readings is one place in time whatever the samples.
-        moved = replace(steps, moving=steps.moving[::every])
+        edges = tuple(
+            Edge(edge.start // every, -(-edge.stop // every), edge.height) for edge in steps.edges
+        )
+        moved = replace(steps, edges=edges, moving=steps.moving[::every])
         return replace(self, problem=fewer, fitted=fitted, steps=moved)
 
     @cached_property

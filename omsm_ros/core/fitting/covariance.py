@@ -9,7 +9,6 @@ from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.uneven_noise import scatter_in_time, uneven_rows
 from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.least_squares import unit_columns
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
@@ -108,8 +107,10 @@ def parameter_covariance(
     on_grid[:, problem.used] = columns.T
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
     meat = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
-    unit, scale = unit_columns(columns)
-    values, directions = np.linalg.eigh(unit.T @ unit)
+    gram = columns.T @ columns
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     least = _RANK_TOLERANCE * float(values[-1])
     strong, weak = directions[:, values > least], directions[:, values <= least]
     bread = strong / values[values > least] @ strong.T

@@ -29,7 +29,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
 from omsm_ros.core.fitting.order_choice import choose as choose_candidate
-from omsm_ros.core.fitting.output_error import Fit, Problem, fit
+from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.fitting.preparation import Prepared
 from omsm_ros.core.identification.model_choice import Model
 
@@ -142,6 +142,13 @@ def _drift(prepared: Prepared) -> list[Judged]:
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     survey = Survey(problem, lag, prepared.steps, (CREEP, DRIFT))
+    # What does not show in fewer samples of a long record need not be looked for in all.
+    if survey.thinned is not None and not _shown_drift(survey.thinned):
+        return []
+    return _shown_drift(survey)
+
+
+def _shown_drift(survey: Survey) -> list[Judged]:
     return [
         judged for judged in _beside(survey, survey.significant()) if judged.term.family == DRIFT
     ]
@@ -156,16 +163,26 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
     if chosen.fit.structure.poles <= _PLAIN_POLES or best is None:
         return []
     survey = Survey(prepared.problem, best, prepared.steps, _BESIDE)
+    fewer = survey.thinned
+    # As above: of a long record not all are looked at where fewer do not ask for it.
+    if fewer is not None:
+        there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
+        if not _describing_more(prepared, fewer, there):
+            return []
+    return _describing_more(prepared, survey, chosen.fit)
+
+
+def _describing_more(prepared: Prepared, survey: Survey, chosen: Fit) -> list[Judged]:
+    """Return what shows, if the fit of ``survey`` describes more beside it than ``chosen`` does."""
     columns = _beside(survey, survey.significant())
-    del survey  # of a long record, memory for the fit
     if not columns:
         return []
-    problem = _with_columns(prepared, columns)[0].problem
-    beside = fit(problem, best.structure, [best.nonlinear])
-    price = (problem.background.shape[1] - prepared.problem.background.shape[1]) * np.log(
-        beside.samples
-    )
-    return columns if information(beside) + price < information(chosen.fit) else []
+    plain, before = survey.fitted, replace(prepared, problem=survey.problem)
+    problem = _with_columns(before, columns)[0].problem
+    beside = fit(problem, plain.structure, [plain.nonlinear])
+    further = problem.background.shape[1] - survey.problem.background.shape[1]
+    better = information(beside) + further * np.log(beside.samples) < information(chosen)
+    return columns if better else []
 
 
 def _but_lines(shown: Sequence[Judged], modes: Sequence[float]) -> list[Judged]:
