@@ -23,6 +23,7 @@ from omsm_ros.core.fitting.covariance import (
     hidden_motion_covariance,
     noise_spectrum,
     parameter_covariance,
+    weighted_gram,
 )
 from omsm_ros.core.fitting.output_error import Problem
 
@@ -295,3 +296,14 @@ def test_what_is_known_exactly_has_no_uncertainty():
     assert not np.any(band.gain)
     assert not np.any(band.phase)
     assert low_frequency_delay_uncertainty(G, nothing) == 0.0
+
+
+def test_noise_through_rows_is_the_same_in_blocks_as_at_once(monkeypatch):
+    """Of white noise it is their Gram matrix times the variance, however many are in memory."""
+    rows = np.random.default_rng(9).normal(size=(7, 90))
+    for length in (90, 96, 101):
+        noise = np.full(length // 2 + 1, 2.5)
+        for values in (10_000, 2 * length):
+            monkeypatch.setattr("omsm_ros.core.fitting.covariance._VALUES", values)
+            found = weighted_gram(rows, length, noise)
+            np.testing.assert_allclose(found, 2.5 * rows @ rows.T, atol=1e-9)

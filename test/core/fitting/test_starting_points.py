@@ -1,5 +1,7 @@
 """Places to start from, judged by how near they come to the answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -92,3 +94,13 @@ def test_a_coarser_problem_has_the_same_response(every):
     found = fit(coarse, structure, [start]).dynamics
     lines = np.geomspace(1.0, 60.0, 8)
     np.testing.assert_allclose(found.response(lines), truth.response(lines), rtol=1e-3)
+
+
+def test_what_is_beyond_the_new_half_rate_folds_nowhere():
+    problem = points_for(resonance(60.0, 0.1)).problem
+    time = np.arange(len(problem.input)) * PERIOD
+    beyond = replace(problem, output=np.sin(2 * np.pi * 140.0 * time))
+    inside = replace(problem, output=np.sin(2 * np.pi * 90.0 * time))
+    at_rest = slice(50, -50)
+    assert np.max(abs(coarser(beyond, 4).output[at_rest])) < 1e-4
+    assert np.max(abs(coarser(inside, 4).output[at_rest])) == pytest.approx(1.0, abs=0.01)
