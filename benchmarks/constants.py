@@ -35,7 +35,7 @@ _PLACES = {
     "FASTEST_CREEP_S": f"{_ROOT}.families",
     "_CREEPS_A_DECADE": f"{_ROOT}.families",
     "_DAMPINGS": f"{_ROOT}.families",
-    "_FASTEST_MODE_HZ": f"{_ROOT}.families",
+    "FASTEST_MODE_HZ": f"{_ROOT}.families",
     "_SLIDING_TRAVELS_M": f"{_ROOT}.families",
     "_FINER": f"{_ROOT}.families",
     "_GAPS_M": f"{_ROOT}.families",
