@@ -130,11 +130,12 @@ class _Ending:
         self._wake: Callable[[], object] = lambda: None
         self._heard, woken = os.pipe()
         os.set_blocking(woken, False)
+        # First of all: one that came between a handler that does nothing and this would be lost.
+        signal.set_wakeup_fd(woken)
         for number in ENDING:
             # Below nohup, it is to be ignored.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
-        signal.set_wakeup_fd(woken)
         threading.Thread(target=self._wait, daemon=True).start()
 
     def wakes(self, wake: Callable[[], object]) -> None:

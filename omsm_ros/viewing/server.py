@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 import http
 import threading
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, quote, urlsplit
 
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -23,6 +23,7 @@ _MOST_BROWSERS = 16
 _MOST_CONNECTIONS = 64
 _PERIOD_S = 0.25
 _STATES_EVERY = 2
+_LONGEST_TOKEN = 200
 # A browser has nothing to say.
 _MOST_BYTES_RECEIVED = 1024
 
@@ -43,6 +44,10 @@ class LiveServer:
                 f"viewer on {host!r} can be seen from other computers: give a token of at least 16 "
                 "characters, or host 127.0.0.1"
             )
+        if len(token) > _LONGEST_TOKEN:
+            raise ConfigurationError(
+                f"token of {len(token)} characters, at most {_LONGEST_TOKEN} fit into an address"
+            )
         self._view, self._page, self._token = view, page, token
         self._host, self._wanted = host, port
         self._server: Server | None = None
@@ -55,7 +60,9 @@ class LiveServer:
             return ""
         port = self._server.socket.getsockname()[1]
         host = f"[{self._host}]" if ":" in self._host else self._host
-        return f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else "")
+        return f"http://{host}:{port}/" + (
+            f"?token={quote(self._token, '')}" if self._token else ""
+        )
 
     def start(self) -> None:
         """Listen; ConfigurationError if the port is taken."""

@@ -148,6 +148,13 @@ def test_beyond_this_computer_only_with_a_token(serve, view):
             pass
 
 
+def test_a_token_of_any_signs_opens_the_page_by_the_address_that_is_told(serve, view):
+    with urllib.request.urlopen(serve(token="a b&c=d#e%f/g+h?ä" * 2).address) as answer:
+        assert answer.status == 200
+    with pytest.raises(ConfigurationError, match="at most 200 fit into an address"):
+        LiveServer(view, "", "127.0.0.1", 0, "x" * 201)
+
+
 def test_a_port_that_is_taken_is_named(serve, view):
     server = serve()
     port = int(re.search(r":(\d+)/", server.address)[1])
