@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hostile import maps, trees
-from hostile.judge import refused
+from hostile.bag_inputs import TOPICS
+from hostile.judge import Case, ask, judge, refused
+
+from omsm_ros.storage.recording.bag_writer import BagWriter
 
 EXPORT = ("export", "{}", "--unit", "m", "--out", "e.x3p")
 IMPORT = ("import", "{}", "--map", "map.yaml", "--out", "new.mcap")
@@ -117,3 +121,15 @@ def test_numbers_of_half_precision_are_held_against_the_same_bounds(place, table
 
     assert "uncertainty[0] is inf m" in refused(place, EXPORT, "made.h5", table(change))
     assert not list(recwarn)
+
+
+def test_a_radius_in_steps_has_a_spectrum_soon(place, small_scan_blocks):
+    """Turns stand still along the path and leap: of its frequencies thousands are strong."""
+    with BagWriter(place / "steps.mcap", TOPICS) as bag:
+        for axes, distance in small_scan_blocks[:12]:
+            bag.write_axes(replace(axes, x=np.round(axes.x, 4)))
+            bag.write_distance(distance)
+    case = Case(("spectrum", "steps.mcap", "--out", "out", "--no-report", "--json"))
+    answer = ask(case, place)
+    assert answer.status == 0
+    judge(case, answer, place)

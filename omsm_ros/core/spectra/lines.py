@@ -127,8 +127,9 @@ def _strongest(
         if len(peaks) and power[peaks[0]] > best[0]:
             # An amplitude only to start with; the fit gives phase and frequency.
             strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
-            new = [start(coordinate, k * spacing, residual) for k in _spaced(strong)]
-            best = float(power[peaks[0]]), new[: MOST_LINES - len(known)]
+            places = _spaced(strong, MOST_LINES - len(known))
+            new = [start(coordinate, k * spacing, residual) for k in places]
+            best = float(power[peaks[0]]), new
     return best[1]
 
 
@@ -198,9 +199,12 @@ def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
     return places[np.argsort(-ratio[places], kind="stable")]
 
 
-def _spaced(places: np.ndarray) -> list[int]:
+def _spaced(places: np.ndarray, most: int) -> list[int]:
+    """Return the first ``most`` of ``places`` that are apart from those before."""
     kept: list[int] = []
     for place in places:
+        if len(kept) >= most:
+            break
         if all(abs(int(place) - k) >= _APART_BINS * OVERSAMPLING for k in kept):
             kept.append(int(place))
     return kept
