@@ -30,7 +30,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 PAPER_POINTS = 290_011
 # Over five hours at 1 kHz; what is done once, however long a scan is, tells little there.
 LONG_POINTS, LONGEST_POINTS = 20_000_000, 50_000_000
-TWO_DRIVERS_POINTS, TWO_DRIVERS_OFFSET = 5_000_000, 4711
+TWO_DRIVERS_OFFSET = 4711
 # Samples of a message; of the probe where it has a driver of its own.
 _BLOCK, _PROBE_BLOCK = 100, 64
 _RUNS = 5
@@ -179,9 +179,9 @@ def _rates(folder: Path, samples: int, used: Used, start: Used) -> Iterator[Row]
 
 def _of_two_drivers(folder: Path, start: Used, of_one: float) -> Row:
     """The same rate where axes and probe were recorded from drivers of their own."""
-    write_two_drivers(folder / "two.mcap", TWO_DRIVERS_POINTS)
+    write_two_drivers(folder / "two.mcap", LONG_POINTS)
     used = _correct(folder, "two.mcap", "--counter-offset", str(TWO_DRIVERS_OFFSET))
-    rate = (TWO_DRIVERS_POINTS - PAPER_POINTS) / (used.cpu - start.cpu)
+    rate = (LONG_POINTS - PAPER_POINTS) / (used.cpu - start.cpu)
     text = f"{rate / of_one:.2f} of one driver's"
     name = "  the same of two drivers, blocks of 100 and 64, offset counters"
     return at_least(name, rate / 1e6, "10⁶/s", 2.0, text)
