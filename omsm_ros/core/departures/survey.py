@@ -9,7 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.departures.families import (
+    BACKLASH,
     FASTEST_MODE_HZ,
+    FRICTION,
     PERIODIC,
     VIBRATION,
     Departures,
@@ -31,6 +33,8 @@ _ABOVE_ROUNDING = 1e-6
 _ROWS, _VALUES = 65_536, 8_000_000
 # A step test rests for most of its time.
 _MOSTLY = 0.5
+# Where a motion turns and what a line is, fewer samples do not tell as well; their terms are few.
+_BY_ALL = (VIBRATION, BACKLASH, FRICTION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +98,7 @@ class Survey:
     def _best_of(self, family: Family) -> Term:
         if len(family.parameters) == 1:
             return family.term(0)
-        if self.thinned is None or family.name == VIBRATION:
+        if self.thinned is None or family.name in _BY_ALL:
             return family.term(int(np.argmax(self.screened(family))))
         alike = self.thinned.departures.alike(family)
         return family.term(int(np.argmax(self.thinned.screened(alike))))

@@ -86,7 +86,7 @@ def _chosen_on_fewer(prepared: Prepared, points: StartingPoints, lag: Fit, order
         return fit(coarse, structure, fewer.of(structure, smaller))
 
     colour = noise_colour(coarse, fewer.pure_delay, steps)
-    found = explore(fit_structure, order, colour, problem.effort)
+    found = explore(fit_structure, order, colour, coarse.effort)
     best = min(c.bic for c in found)
     price = noise_colour(problem, lag, prepared.steps)
 
