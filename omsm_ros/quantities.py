@@ -137,7 +137,8 @@ STAMP = Quantity(
     "stamp", "ns", -_MAX_STAMP_NS, _MAX_STAMP_NS, "set the clock of the sender", whole=True
 )
 # Any quantity in any unit: its square, summed over a record, stays finite.
-SIGNAL = Quantity("signal", "", -1e100, 1e100, "scale it")
+# Products of four of them are floats.
+SIGNAL = Quantity("signal", "", -1e50, 1e50, "scale it")
 POSITION = Quantity("position", "m", -100.0, 100.0, "give it in metres")
 DISTANCE = Quantity("distance", "m", -100.0, 100.0, "give it in metres")
 # A spindle's angle is counted on over its turns: a year at 30 rpm makes 1e8 rad.

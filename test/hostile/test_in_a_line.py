@@ -146,3 +146,22 @@ def test_a_covariance_of_noise_is_one_too(place, true_calibration):
 def test_an_option_whose_value_is_two_dashes_has_none(place):
     words = ("surface", "show", "surface.yaml", "--radius", "0.002", "--feed=--")
     assert "'--feed=--' has no value" in refused(place, *words)
+
+
+@pytest.mark.parametrize("hold", ["zero-order", "band-limited"])
+def test_one_wild_value_of_a_table_overflows_nothing(place, hold):
+    """An input that is nothing but for one value, where the output is as large as may be."""
+    u, y = 1e-300 * np.arange(599.0), 1e-6 * np.sin(0.11 * np.arange(599))
+    u[254] = 0.6
+    words = ("identify", "t.csv", "--input", "u", "--output", "y", "--period", "1e-3")
+    words = (*words, "--order", "2", "--hold", hold, "--out", "new.json")
+    for largest in (-9e49, -9e97):
+        y[254] = largest
+        text = "u,y\n" + "\n".join(
+            f"{a!r},{b!r}" for a, b in zip(u.tolist(), y.tolist(), strict=True)
+        )
+        if largest < -1e50:
+            assert "expected a number from -1e+50 to 1e+50" in refused(place, *words, t_csv=text)
+        else:
+            case = Case((*words, "--json"), {"t.csv": text.encode()})
+            judge(case, ask(case, place), place)

@@ -123,13 +123,23 @@ def test_numbers_of_half_precision_are_held_against_the_same_bounds(place, table
     assert not list(recwarn)
 
 
-def test_a_radius_in_steps_has_a_spectrum_soon(place, small_scan_blocks):
-    """Turns stand still along the path and leap: of its frequencies thousands are strong."""
-    with BagWriter(place / "steps.mcap", TOPICS) as bag:
-        for axes, distance in small_scan_blocks[:12]:
-            bag.write_axes(replace(axes, x=np.round(axes.x, 4)))
-            bag.write_distance(distance)
-    case = Case(("spectrum", "steps.mcap", "--out", "out", "--no-report", "--json"))
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        # Turns stand still along the path and leap: of its frequencies thousands are strong.
+        (("spectrum", "steps.mcap", "--out", "out", "--no-report"), 0),
+        # No place has neighbours at its own radius and at others.
+        (("selfcal", "scan.mcap", "steps.mcap", "--out", "new.json"), 2),
+    ],
+)
+def test_a_radius_in_steps_is_judged_soon(place, small_scan_blocks, words, status):
+    for name, digits in (("scan", 12), ("steps", 4)):
+        (place / f"{name}.mcap").unlink(missing_ok=True)
+        with BagWriter(place / f"{name}.mcap", TOPICS) as bag:
+            for axes, distance in small_scan_blocks[:12]:
+                bag.write_axes(replace(axes, x=np.round(axes.x, digits)))
+                bag.write_distance(distance)
+    case = Case((*words, "--json"))
     answer = ask(case, place)
-    assert answer.status == 0
     judge(case, answer, place)
+    assert answer.status == status

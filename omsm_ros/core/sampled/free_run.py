@@ -17,7 +17,7 @@ from omsm_ros.least_squares import least_squares
 # The least that shows more than an initial state of 20 poles and an offset.
 _LEAST_SAMPLES = 50
 # The square of a smaller change, over a noise that is smaller still, is no float.
-_LEAST_CHANGE = 1e-100
+_LEAST_CHANGE = 1e-50
 
 
 @dataclass(frozen=True, eq=False)

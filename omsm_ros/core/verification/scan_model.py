@@ -66,6 +66,11 @@ class ScanModel:
                 f"{outer!r} m; scan the same part of the surface"
             )
         within = [(s.radius >= inner) & (s.radius <= outer) for s in scans]
+        if not all(map(np.any, within)):
+            raise DataError(
+                f"a scan has no points between radii of {inner!r} and {outer!r} m, which the scans "
+                "share; scan the same part of the surface"
+            )
         self.number = len(scans)
         self.scan: IntArray = np.repeat(
             np.arange(len(scans)), [np.count_nonzero(w) for w in within]
