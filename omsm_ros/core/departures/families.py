@@ -199,16 +199,15 @@ class Departures:
             yield Family.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
 
     def linearity(self) -> Family:
-        """Return square and cube of the position in the travel: a probe that is not linear."""
-        place = self._place
-        columns = np.column_stack([place**2, place**3])
-        return Family.of(LINEARITY, np.zeros(1), 1.0, columns)
+        """Return square and cube of the place in the travel: a probe that is not linear.
 
-    @property
-    def _place(self) -> FloatArray:
-        motion = self.problem.input
+        Of the place that the probe sees, late as it is: of the axis's own, a scale that changes by
+        a per cent would pass for one per cent of the lag.
+        """
+        motion, seen = self.problem.input, self._in_time(self._answer) / self.fitted.gain
         middle = 0.5 * (motion.max() + motion.min())
-        return np.asarray((motion - middle) / (0.5 * np.ptp(motion) or 1.0))
+        place = (seen - middle) / (0.5 * np.ptp(motion) or 1.0)
+        return Family.of(LINEARITY, np.zeros(1), 1.0, np.column_stack([place**2, place**3]))
 
     def stiffening(self) -> Family:
         """Return the cube of the deflection (output less input), over its largest value."""

@@ -63,6 +63,7 @@ def test_what_is_stated_holds_the_truth(of_mode):
     assert np.all(abs(off) < 3 * np.hypot(band.gain, band.phase))
 
 
+@pytest.mark.soak
 def test_a_latency_that_jumps_rejects_a_long_test_too(of_mode):
     half = len(of_mode) // 2
     later = np.where(np.arange(len(of_mode)) < half, of_mode.distance, np.roll(of_mode.distance, 1))
