@@ -23,6 +23,7 @@ IMPORT = ("import", "{}", "--map", "map.yaml", "--out", "new.mcap")
 def place(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("places")
     maps.write_maps(folder)
+    maps.write_tables(folder)
     (folder / "map.yaml").write_text(json.dumps(trees.COLUMNS))
     (folder / "surface.yaml").write_text("shape: sphere\nradius: -0.1\n")
     os.mkfifo(folder / "pipe")
@@ -130,16 +131,30 @@ def test_numbers_of_half_precision_are_held_against_the_same_bounds(place, table
         (("spectrum", "steps.mcap", "--out", "out", "--no-report"), 0),
         # No place has neighbours at its own radius and at others.
         (("selfcal", "scan.mcap", "steps.mcap", "--out", "new.json"), 2),
+        # A radius that is nothing but for its last bits is no coordinate.
+        (("spectrum", "none.mcap", "--out", "out", "--no-report"), 0),
     ],
 )
 def test_a_radius_in_steps_is_judged_soon(place, small_scan_blocks, words, status):
-    for name, digits in (("scan", 12), ("steps", 4)):
+    changes = {"scan": lambda x: x, "steps": lambda x: np.round(x, 4), "none": lambda x: 1e-310 * x}
+    for name, change in changes.items():
         (place / f"{name}.mcap").unlink(missing_ok=True)
         with BagWriter(place / f"{name}.mcap", TOPICS) as bag:
             for axes, distance in small_scan_blocks[:12]:
-                bag.write_axes(replace(axes, x=np.round(axes.x, digits)))
+                bag.write_axes(replace(axes, x=change(axes.x)))
                 bag.write_distance(distance)
     case = Case((*words, "--json"))
     answer = ask(case, place)
     judge(case, answer, place)
     assert answer.status == status
+
+
+def test_a_surface_metres_away_leaves_rounding(place):
+    """Its figures are values or none; of a variance, rounding may be less than nothing."""
+    surface = {"shape": "zernike", "radius": 0.006, "indexing": "noll"}
+    surface["coefficients"] = [3.15, *[1e-7] * 8]
+    words = ("compensate", "good.csv", "--nominal", "a.yaml", "--low-pass", "4e-3", "--out", "out")
+    case = Case(
+        (*words, "--fit", "piston,tip,tilt", "--json"), {"a.yaml": json.dumps(surface).encode()}
+    )
+    judge(case, ask(case, place), place)

@@ -84,4 +84,6 @@ def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> Figure:
         gram += chosen @ columns[places].T
     shares = np.linalg.solve(gram, right)[POWER.index(Term(2, 0))]
     variance = shares @ fit.covariance @ shares + np.sum(np.square(shares @ fit.effects))
-    return Figure(float(2 * np.abs(shares @ fit.coefficients)), float(2 * np.sqrt(variance)))
+    # Of heights that are metres off, rounding is all that is left of it.
+    uncertainty = float(2 * np.sqrt(variance)) if variance >= 0 else None
+    return Figure(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)

@@ -29,6 +29,8 @@ _MOST_COMPARED = 4096
 # So far from the mean pace, in resolutions, where a path is curved; at a quarter of one a line has
 # 95 % of its power.
 _SEARCHED_BINS, _STEPS_IN_A_BIN = 12, 4
+# Less is no motion of an axis.
+_LEAST_MOVED_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +66,12 @@ def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
     for name in (TIME, PATH, TURN, RADIUS):
         values = signal.coordinate(name)
         reach = float(np.ptp(values))
-        least = {RADIUS: 1e-3 * float(signal.radius.max()), TURN: 0.01}.get(name, 0.0)
-        if reach > least:
+        least = {
+            PATH: _LEAST_MOVED_M,
+            RADIUS: max(1e-3 * float(signal.radius.max()), _LEAST_MOVED_M),
+            TURN: 0.01,
+        }
+        if reach > least.get(name, 0.0):
             found[name] = _coordinate(signal, name, values, found)
     return found
 
