@@ -81,7 +81,7 @@ class LiveServer:
             close_timeout=1,
         )
         self._server.handler = listening.leaving_after(self._server.handler)
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        threading.Thread(target=_serve, args=(self._server,), daemon=True).start()
 
     def stop(self) -> None:
         """Close every connection."""
@@ -183,3 +183,12 @@ def _response(status: http.HTTPStatus, headers: Headers, text: str) -> Response:
     headers["Content-Length"] = str(len(body))
     headers["Connection"] = "close"
     return Response(status.value, status.phrase, headers, body)
+
+
+def _serve(server: Server) -> None:
+    """Serve until the server is shut down, which waits for the end, however this ends."""
+    try:
+        server.serve_forever()
+    finally:
+        # Of a server that is shut down before it begins, websockets forgets to tell.
+        server.socket_closed.set()

@@ -6,6 +6,7 @@ import json
 import re
 import resource
 import socket as sockets
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -18,6 +19,7 @@ import pytest
 pytest.importorskip("websockets", reason="websockets is an optional package")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.sync.server import Server
 
 from omsm_ros.core.correction.surface_points import POINT_DTYPE
 from omsm_ros.errors import ConfigurationError
@@ -249,3 +251,14 @@ def test_the_page_is_there_again_after_the_process_ran_out_of_files(serve):
         time.sleep(0.5)
     with urllib.request.urlopen(server.address, timeout=5) as answer:
         assert answer.status == 200
+
+
+def test_a_server_that_never_began_is_stopped_all_the_same(serve, monkeypatch):
+    """Its thread ends before it serves: whoever stops it would wait for ever."""
+
+    def fail(self):
+        raise OSError(24, "too many open files")
+
+    monkeypatch.setattr(Server, "serve_forever", fail)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    serve()
