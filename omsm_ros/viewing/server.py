@@ -190,5 +190,6 @@ def _serve(server: Server) -> None:
     try:
         server.serve_forever()
     finally:
-        # Of a server that is shut down before it begins, websockets forgets to tell.
+        # Where it ends before it has begun, websockets does neither.
         server.socket_closed.set()
+        server.shutdown_watcher.close()
