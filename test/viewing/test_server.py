@@ -238,6 +238,7 @@ def test_who_only_knocks_leaves_room_for_a_browser_and_too_many_are_told(serve):
 def test_the_page_is_there_again_after_the_process_ran_out_of_files(serve):
     """A server that stopped at the first failure of accept was silent for good."""
     server = serve()
+    urllib.request.urlopen(server.address, timeout=5).close()  # it has begun
     least = len(list(Path("/proc/self/fd").iterdir()))
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     with ExitStack() as files:
