@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
 
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.verification.eliminated_surface import normal_equations
@@ -280,11 +279,14 @@ class _Fit:
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of a positive matrix whose rows have different units."""
+    """Return the inverse of a positive matrix whose rows have different units.
+
+    A direction that is lost in rounding is as little known as rounding lets one say.
+    """
     scale = 1 / np.sqrt(np.diag(matrix))
-    return np.asarray(
-        scale[:, np.newaxis] * linalg.inv(matrix * scale * scale[:, np.newaxis]) * scale
-    )
+    values, vectors = np.linalg.eigh(matrix * scale * scale[:, np.newaxis])
+    known = np.maximum(values, len(values) * np.finfo(np.float64).eps * values[-1])
+    return np.asarray(scale[:, np.newaxis] * ((vectors / known) @ vectors.T) * scale)
 
 
 def _precision(model: ScanModel, prior: Prior) -> FloatArray:

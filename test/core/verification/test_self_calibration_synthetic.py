@@ -9,7 +9,12 @@ import pytest
 
 from omsm_ros.core.verification.scan_model import CURVATURE, GAIN, LAG, LATENCY
 from omsm_ros.core.verification.scan_reader import ScanColumns
-from omsm_ros.core.verification.self_calibration import Prior, SelfCalibration, self_calibrate
+from omsm_ros.core.verification.self_calibration import (
+    Prior,
+    SelfCalibration,
+    _inverse,
+    self_calibrate,
+)
 
 from .synthetic_scans import coma, scanned
 
@@ -217,3 +222,19 @@ def test_scatter_over_repetitions_is_what_is_stated() -> None:
         stated.append(spread(found, LATENCY))
     # A standard deviation of ten is known to 23 %.
     assert 0.5 < np.sqrt(np.mean(np.square(off))) / np.mean(stated) < 1.6
+
+
+def test_a_direction_lost_in_rounding_is_hardly_known() -> None:
+    """Of two columns that are one, their sum is known and their difference is not."""
+    units = np.array([1e-6, 1e3])
+    found = _inverse(np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer(units, units))
+    in_units = found * np.outer(units, units)
+    assert np.ones(2) @ in_units @ np.ones(2) == pytest.approx(1.0, rel=1e-3)
+    assert np.array([1.0, -1.0]) @ in_units @ np.array([1.0, -1.0]) > 1e14
+
+
+def test_an_inverse_is_that_of_the_textbook() -> None:
+    units = np.array([1e-6, 1e3])
+    found = _inverse(np.array([[2.0, 1.0], [1.0, 3.0]]) * np.outer(units, units))
+    expected = np.array([[0.6, -0.2], [-0.2, 0.4]]) / np.outer(units, units)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
