@@ -19,7 +19,7 @@ from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roo
 from omsm_ros.core.fitting.descent import Effort
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import least_squares
 
 # Guess of the slowest pole, in units of the rate at which the motion has its content.
@@ -116,7 +116,8 @@ class StartingPoints:
 def coarser(problem: Problem, every: int) -> Problem:
     """Return the problem at every so many samples, all of it filtered by the same low pass.
 
-    A linear response of one is that of the other. Lost samples are bridged by a straight line.
+    A linear response of one is that of the other. Lost samples are bridged by a straight line, and
+    so is what lies between readings that are rarer than the samples of the axis.
     """
     index = np.arange(len(problem.used))
     output = np.interp(index, index[problem.used], problem.output[problem.used])
@@ -133,12 +134,26 @@ def coarser(problem: Problem, every: int) -> Problem:
         problem,
         input=thinned(problem.input),
         output=thinned(output),
-        used=problem.used[::every],
+        used=_bridged(problem.used, every),
         period=problem.period * every,
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
         plateau=None,
     )
+
+
+def _bridged(used: BoolArray, every: int) -> BoolArray:
+    """Return, of every so many samples, which are used or lie in a bridge that hides nothing.
+
+    Such a bridge is no longer than a new sample, or than the readings are apart anyhow: where every
+    second sample holds a reading, those picked may all lie between them.
+    """
+    picked, places = np.arange(0, len(used), every), np.flatnonzero(used)
+    apart = np.diff(places)
+    after = np.searchsorted(places, picked)
+    inside = (after > 0) & (after < len(places))
+    short = apart <= max(every, int(np.median(apart)))
+    return np.asarray(used[picked] | (inside & short[np.where(inside, after - 1, 0)]))
 
 
 def _guess(scaled: Scaled, delay: float) -> FloatArray:

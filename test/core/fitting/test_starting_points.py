@@ -104,3 +104,24 @@ def test_what_is_beyond_the_new_half_rate_folds_nowhere():
     at_rest = slice(50, -50)
     assert np.max(abs(coarser(beyond, 4).output[at_rest])) < 1e-4
     assert np.max(abs(coarser(inside, 4).output[at_rest])) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("offset", range(3))
+def test_readings_rarer_than_the_samples_of_the_axis_are_seen_in_fewer_samples(offset):
+    """Every third sample holds a reading: those of the coarser problem may all lie between."""
+    problem = points_for(resonance(30.0, 0.3), finer=3).problem
+    rare = np.zeros(len(problem.used), bool)
+    rare[offset::3] = True
+    fewer = coarser(replace(problem, used=rare, output=np.where(rare, problem.output, 0.0)), 3)
+    whole = coarser(problem, 3)
+    assert np.mean(fewer.used) > 0.99
+    error = (fewer.output - whole.output)[fewer.used]
+    assert np.sqrt(np.mean(error**2)) < 3e-3 * np.ptp(whole.output)
+
+
+def test_what_was_lost_for_longer_than_a_new_sample_stays_lost():
+    problem = points_for(resonance(30.0, 0.3), finer=3).problem
+    used = problem.used.copy()
+    used[6000:6100] = used[300] = False
+    fewer = coarser(replace(problem, used=used), 3)
+    assert np.flatnonzero(~fewer.used).tolist() == list(range(2000, 2034))
