@@ -143,6 +143,9 @@ class _Findings:
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)
             found = [*self._axes.faults("axes"), *found]
+            lapse = scan.time_lapse
+            found += [*self._axes.period_fault("axes", lapse)]
+            found += [*self._distance.period_fault("distance", lapse)]
             found += skew_fault(skew, scan.sample_period, scan.trigger)
             samples = scan.account.distance.counted.get("slipped", 0)
             found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)

@@ -18,8 +18,9 @@ from omsm_ros.core.samples.accounts import Account, Reason
 from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.samples.joining_by_stamp import axes_at_probe
 from omsm_ros.core.samples.slips import CommonTrigger, Slip
-from omsm_ros.errors import BagError
+from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.storage import bags
 from omsm_ros.storage.recording.topics import AnyBag
 
@@ -55,7 +56,8 @@ class ByStamps:
 class CorrectedScan:
     """A bag opened and its surface points as they are corrected; use it as a context manager.
 
-    sample_period: of the scan [s];  admitted, reasons: the decision to use the calibration
+    sample_period: of the scan [s];  time_lapse: how much faster it was played [1], if settings say
+    admitted, reasons: the decision to use the calibration
     recorded_ns: when the recording began [ns, ROS time], None where nobody knows
     temperatures: that were recorded (n,) [°C], in their order; NaN: cannot be
     by_stamps: join the streams by their stamps, for which all samples are held in memory;
@@ -88,6 +90,7 @@ class CorrectedScan:
             if first is None:
                 raise BagError(f"{str(self.path)!r} has no samples on {TOPICS}; record a scan")
             self.sample_period = float(first.sample_period)
+            self.time_lapse = self._time_lapse()
             self._rest = chain([first], blocks)
             self.recorded_ns, self.temperatures = bag.recorded_ns, bag.temperatures()
             self.reasons = objections(
@@ -158,6 +161,11 @@ class CorrectedScan:
     def trigger(self) -> CommonTrigger:
         """What is stated of the two counters."""
         return self._options.trigger
+
+    def _time_lapse(self) -> float:
+        stated = {**self._calibration.settings, **(self._admission.settings or {})}
+        lapse = stated.get("time_lapse", 1.0)
+        return TIME_LAPSE.checked(lapse, ConfigurationError, "setting 'time_lapse'")
 
     def _blocks(self, bag: bags.BagReader) -> Iterator[Any]:
         total = bag.count(TOPICS)

@@ -1,7 +1,9 @@
-"""What do the counters and stamps of a recording say against it?
+"""What do the counters, stamps and readings of a recording say against it?
 
 Samples that never came leave a gap in the counter and nothing else; two counters that were not
-started together pair samples of different instants, and only their stamps show it.
+started together pair samples of different instants, and only their stamps show it. A probe
+scatters: what stands still to the last digit, or piles up at one end of all readings, was not
+measured, but repeated by a driver, cut off, or stands for no reading.
 """
 
 from __future__ import annotations
@@ -10,16 +12,30 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import (
+    SAME_PERIOD,
+    AxisBlock,
+    Block,
+    DistanceBlock,
+    FloatArray,
+    IntArray,
+)
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger
-from omsm_ros.readable import quantity
+from omsm_ros.core.samples.stamped_period import contradiction
+from omsm_ros.readable import plain, quantity
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
 
 # Places that are named; of more, the number.
 _NAMED = 3
 # Stamps of two clocks scatter; a counter is off by one sample or by none.
 _SKEW_SAMPLES = 0.5
+# Readings in succession, and as many times the mean of all others: coarse readings of a probe that
+# follows a slow surface repeat, and some ten times as long where that turns.
+_LEAST_HELD, _LONGER = 100, 50.0
+# Readings at an end of all, and as many times those next to it; of coarse ones, which repeat this
+# often on the average, many may lie there.
+_LEAST_PILED, _PILED, _COARSE = 20, 10.0, 5.0
 
 
 class StreamWatch:
@@ -37,9 +53,10 @@ class StreamWatch:
         self.least, self.most = np.inf, -np.inf
         self.gaps: list[tuple[int, int]] = []
         self.periods: set[float] = set()
+        self._readings = _Readings()
         self._count = TriggerCount()
         # Of each session: counts of first samples and their stamps [ns].
-        self._marks: list[list[tuple[int, int]]] = []
+        self._marks: list[list[IntArray]] = []
 
     def add(self, block: Block) -> None:
         """Take the next block."""
@@ -56,12 +73,13 @@ class StreamWatch:
             self._marks.append([])
         self.restarts = len(self._marks) - 1
         if not arrival.skip:
-            self._marks[arrival.session].append((block.first_sample, block.stamp_ns))
+            self._marks[arrival.session].append(block.stamps)
         if isinstance(block, DistanceBlock):
             self.invalid += int(np.sum(~block.ok))
             valid = block.distance[block.ok]
             self.least = float(np.min(valid, initial=self.least))
             self.most = float(np.max(valid, initial=self.most))
+            self._readings.add(valid)
         elif isinstance(block, AxisBlock):
             axes = np.array([block.x, block.y, block.z, block.b, block.c])
             self.invalid += int(np.sum(~np.all(np.isfinite(axes), axis=0)))
@@ -69,13 +87,26 @@ class StreamWatch:
     def marks(self, since_ns: int) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield counts, and stamps after ``since_ns`` [s], of the blocks of each session."""
         for session in self._marks:
-            counts, stamps = np.array(session, np.int64).reshape(-1, 2).T
+            counts, stamps = np.concatenate([np.empty((0, 2), np.int64), *session]).T
             yield counts.astype(np.float64), (stamps - since_ns) / NANOSECONDS_PER_S
 
     @property
     def begin_ns(self) -> int:
         """Stamp of the first block [ns]; 0 without one."""
-        return self._marks[0][0][1] if self.samples else 0
+        return int(self._marks[0][0][0, 1]) if self.samples else 0
+
+    def period_fault(self, name: str, time_lapse: float = 1.0) -> Iterator[str]:
+        """Yield what the stamps of the longest session say against the stated sample period.
+
+        time_lapse: how much faster than real time the recording was played [1]
+        """
+        longest = max(self.marks(self.begin_ns), key=lambda marks: len(marks[0]), default=None)
+        if longest is None or len(self.periods) > 1:
+            return
+        count, stamp = longest
+        said = contradiction(name, count, stamp, min(self.periods), time_lapse)
+        if said is not None:
+            yield said
 
     def faults(self, name: str) -> Iterator[str]:
         """Yield what is wrong, in words for people; nothing is with what never came."""
@@ -102,6 +133,83 @@ class StreamWatch:
                 f"{quantity(self.least, 'm')}, to the last digit: a probe scatters; look whether "
                 "it measures, and whether its driver passes on what it sends"
             )
+        else:
+            yield from self._readings.faults(name)
+
+
+class _Readings:
+    """Follows the valid readings of a probe [m], in their order: how long they stood still."""
+
+    def __init__(self) -> None:
+        self._samples = self._changes = 0
+        self._run, self._last = 0, np.nan
+        self._longest, self._value = 0, np.nan
+        # The least are the greatest with their sign turned.
+        self._ends = {"greatest": (1, _End()), "least": (-1, _End())}
+
+    def add(self, readings: FloatArray) -> None:
+        """Take the next readings (n,), finite."""
+        if not len(readings):
+            return
+        self._samples += len(readings)
+        begins = np.flatnonzero(np.diff(readings, prepend=self._last) != 0)
+        self._changes += len(begins)
+        # The first goes on with what stood at the end of the readings before.
+        runs = np.diff(np.concatenate([[-self._run], begins, [len(readings)]]))
+        place = int(np.argmax(runs))
+        if runs[place] > self._longest:
+            self._longest = int(runs[place])
+            self._value = float(readings[begins[place - 1]]) if place else self._last
+        self._run, self._last = int(runs[-1]), float(readings[-1])
+        for sign, end in self._ends.values():
+            end.add(sign * readings)
+
+    def faults(self, name: str) -> Iterator[str]:
+        """Yield what was held or cut off, in words for people."""
+        others = (self._samples - self._longest) / max(self._changes - 1, 1)
+        if self._changes > 2 and self._longest >= max(_LEAST_HELD, _LONGER * others):
+            yield (
+                f"{name}: {self._longest} readings in succession are "
+                f"{quantity(self._value, 'm')}, to the last digit, where others change every "
+                f"{plain(max(others, 1.0), 2)}: a probe scatters; look whether its driver repeats "
+                "the last reading where there is none, and mark those as invalid"
+            )
+        for word, (sign, end) in self._ends.items():
+            if end.piled and end.times > self._longest and others < _COARSE:
+                yield (
+                    f"{name}: {end.times} of {self._samples} readings are the {word}, "
+                    f"{quantity(sign * end.value, 'm')} to the last digit: the probe is at the end "
+                    "of its range, or that number stands for no reading; centre the probe, or mark "
+                    "such readings as invalid"
+                )
+
+
+class _End:
+    """The greatest of all values and how often it came, and the same of the next."""
+
+    def __init__(self) -> None:
+        self.value, self.times = -np.inf, 0
+        self._next, self._next_times = -np.inf, 0
+
+    def add(self, values: FloatArray) -> None:
+        """Take more values (n,); most bring neither of the two."""
+        while len(values) and (greatest := float(np.max(values))) >= self._next:
+            times = int(np.count_nonzero(values == greatest))
+            if greatest > self.value:
+                self._next, self._next_times = self.value, self.times
+                self.value, self.times = greatest, times
+            elif greatest == self.value:
+                self.times += times
+            else:
+                again = self._next_times if greatest == self._next else 0
+                self._next, self._next_times = greatest, again + times
+                return
+            values = values[values < greatest]
+
+    @property
+    def piled(self) -> bool:
+        """Whether the outermost value came far more often than the next."""
+        return self.times >= _LEAST_PILED and self.times > _PILED * self._next_times
 
 
 def counter_skew(axes: StreamWatch, distance: StreamWatch) -> float | None:

@@ -1,5 +1,7 @@
 """A written sample period against the stamps, with jitter and gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,3 +56,13 @@ def test_a_time_lapse_may_be_declared():
     check_period("axis", played, 20.0)
     with pytest.raises(DataError, match="time_lapse"):
         check_period("axis", played)
+
+
+@pytest.mark.parametrize("jump", [3.7, -2.0])
+def test_a_clock_that_was_set_is_not_taken_for_a_wrong_period(jump):
+    recorded = blocks(1e-3, 1e-3, jitter=1e-4)
+    late = [replace(b, stamp_ns=b.stamp_ns + round(jump * 1e9)) for b in recorded[40:]]
+    with pytest.raises(
+        DataError, match=r"the stamps jump by .* at sample 4000 .* the clock was set"
+    ):
+        check_period("axis", recorded[:40] + late)

@@ -82,6 +82,67 @@ def test_a_probe_that_never_changes_is_named_with_what_it_says() -> None:
     assert faults(lost) == []
 
 
+def readings(values: np.ndarray, size: int = 100) -> list[DistanceBlock]:
+    parts = np.split(values, range(size, len(values), size))
+    return [replace(distance(k * size, len(part)), distance=part) for k, part in enumerate(parts)]
+
+
+def scattered(samples: int, step: float = 1e-9) -> np.ndarray:
+    noise = np.random.default_rng(8).normal(0.0, 10e-9, samples)
+    return np.round(noise / step) * step
+
+
+@pytest.mark.parametrize("step", [1e-15, 1e-9, 20e-9])
+@pytest.mark.parametrize("size", [1, 7, 100, 10_000])
+def test_readings_that_scatter_are_no_fault(step: float, size: int) -> None:
+    assert faults(*readings(scattered(4000, step), size)) == []
+
+
+@pytest.mark.parametrize("size", [1, 7, 100, 10_000])
+def test_a_reading_that_is_held_is_named_with_how_long(size: int) -> None:
+    values = scattered(4000)
+    values[1234:1789] = 55.5e-9
+    (said,) = faults(*readings(values, size))
+    assert "555 readings in succession are 55.5 nm" in said
+
+
+@pytest.mark.parametrize(("sign", "word"), [(1, "greatest"), (-1, "least")])
+def test_a_clipped_probe_and_a_number_for_no_reading_pile_up(sign: int, word: str) -> None:
+    clipped = sign * np.minimum(scattered(4000, 1e-12), 10e-9)
+    times = int(np.sum(clipped == sign * 10e-9))
+    (said,) = faults(*readings(clipped))
+    assert f"{times} of 4000 readings are the {word}" in said
+    values = scattered(4000)
+    values[::40] = sign * 9999e-6
+    (said,) = faults(*readings(values))
+    assert f"100 of 4000 readings are the {word}, {'-' * (sign < 0)}10.0 mm" in said
+
+
+def test_plateaus_of_coarse_readings_are_no_fault() -> None:
+    plateaus = np.repeat([0.0, 1e-6, 0.0, 1e-6, 2e-6, 1e-6], 500)
+    assert faults(*readings(plateaus)) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "lapse", "said"), [(1, 1, 0), (1.01, 1, 1), (2, 1, 1), (0.05, 20, 0)]
+)
+def test_stamps_that_contradict_the_period_are_named(factor, lapse, said) -> None:
+    blocks = [
+        replace(axes(first), stamp_ns=EPOCH + round(first * factor * 1e6))
+        for first in range(0, 5000, 100)
+    ]
+    found = list(watched(*blocks).period_fault("axes", lapse))
+    assert len(found) == said
+    assert all("sample period of 0.001 s" in text for text in found)
+
+
+def test_messages_that_were_joined_tell_their_stamps() -> None:
+    parts = np.array([(first, EPOCH + 2_000_000 * first) for first in range(0, 5000, 100)])
+    joined = replace(axes(0, 5000), parts=parts)
+    (said,) = watched(joined).period_fault("axes")
+    assert "by their stamps it is 0.002 s" in said
+
+
 @pytest.mark.parametrize("samples", [1, -1, 10, 100, 400])
 def test_a_counter_that_is_off_is_found_by_the_stamps(samples: int) -> None:
     one = watched(*(axes(first) for first in range(0, 5000, 100)))
