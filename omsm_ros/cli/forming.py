@@ -93,7 +93,10 @@ def _declare_compensate(sub: argparse.ArgumentParser) -> None:
         help=f"a turn of the next cut [m]: writes {PATH}, offsets of Z over X and C, as G-code",
     )
     sub.add_argument(
-        "--per-turn", type=number(quantities.PER_TURN), default=360, help="places of the spiral"
+        "--per-turn",
+        type=number(quantities.SPIRAL_PLACES),
+        default=360,
+        help="places of the spiral",
     )
     declare_fit(sub, (AUTO,))
 
@@ -133,7 +136,9 @@ def _declare_surface(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--rpm", type=speed, default=30.0, help="of the spindle")
     sub.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="as of omsm predict")
     sub.add_argument(
-        "--probe-angle", type=number(quantities.TURN), help="to the normal, at which it reads [rad]"
+        "--probe-angle",
+        type=number(quantities.PROBE_ANGLE),
+        help="to the normal, at which it reads [rad]",
     )
     sub.add_argument("--out", type=Path, metavar="DIR", help="for a picture")
 

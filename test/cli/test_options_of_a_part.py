@@ -78,6 +78,14 @@ def test_the_spiral_of_the_next_cut_has_so_many_places_a_turn(facts, per_turn):
     assert found["path_places"] == pytest.approx(per_turn * RADIUS / feed, rel=0.1)
 
 
+@pytest.mark.parametrize("per_turn", ["-360", "1"])
+def test_a_spiral_needs_places_on_each_turn(per_turn, tmp_path, capsys):
+    words = ["compensate", "any.ply", "--nominal", "any.yaml", "--low-pass", "4e-3"]
+    words += ["--spiral", "1e-4", f"--per-turn={per_turn}", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    assert "places a turn is" in capsys.readouterr().err
+
+
 def test_a_compensation_is_of_the_aperture_alone(facts):
     whole, _ = facts("compensate", "--low-pass", 4e-3)
     part, out = facts("compensate", "--low-pass", 4e-3, "--aperture", "5e-3")

@@ -64,3 +64,6 @@ def test_the_command_draws_it(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "CANNOT follow" in said
     assert "11.5°" in said
+    for wrong in ("-0.1", "90"):
+        assert main([*words[:-2], f"--probe-angle={wrong}"]) == 2
+        assert "expected a number from 0 to 1.57" in capsys.readouterr().err

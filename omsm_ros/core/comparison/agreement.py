@@ -34,6 +34,8 @@ _DRAWS = 300
 _HARDLY_SMOOTHED = 0.7
 # A term of which the others explain all but this share is not told from them.
 _LEAST_OWN_SHARE = 1e-4
+# Of the largest power of a correlation matrix: what is smaller is the rounding of its entries.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,13 +245,25 @@ def _terms(
     shapes = fitted @ rows.T
     covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
     spread = np.sqrt(np.diag(covariance))
-    whitened = np.linalg.solve(covariance / np.outer(spread, spread), value / spread)
+    chi_square, told = _chi_square(value / spread, covariance / np.outer(spread, spread))
     factor = _factor(len(names))
     terms = tuple(
         TermNumber(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
         for term, d, s in zip(names, value, spread, strict=True)
     )
-    return terms, float(chdtrc(len(names), whitened @ (value / spread))), (radius, x0, y0)
+    return terms, float(chdtrc(told, chi_square)), (radius, x0, y0)
+
+
+def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]:
+    """Return χ² of ``value`` (t,) with covariance ``correlation`` (t, t), and its degrees.
+
+    Beside errors stated to be very large some mixtures of terms have none but rounding: of those
+    nothing is known.
+    """
+    powers, directions = np.linalg.eigh(correlation)
+    known = powers > _ROUNDING * powers[-1]
+    along = directions[:, known].T @ value
+    return float(np.sum(along**2 / powers[known])), int(np.sum(known))
 
 
 def _rows(matched: Matched, values: FloatArray) -> tuple[list[Term], FloatArray]:

@@ -241,7 +241,9 @@ def _not_determined(
 
 
 def _own(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of a column (n,) that the others do not explain."""
+    """Return the part of a column (n,) that the others, if there are any, do not explain."""
+    if not others:
+        return column
     design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]
     return np.asarray(column - design @ np.linalg.lstsq(design, column, rcond=1e-10)[0])
 

@@ -245,7 +245,8 @@ def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> 
 
     spacing: of the map [m] instead
 
-    Raises DataError for points that are no area, or a spacing that makes too large a map.
+    Raises DataError for points that are no area, or a spacing that makes too large a map, or one
+    without a single height.
     """
     side = spacing or cell_side(points.x, points.y, most)
     shape = tuple(int(np.floor(np.ptp(v) / side)) + 1 for v in (points.y, points.x))
@@ -258,5 +259,10 @@ def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> 
     x, y = (part.ravel() for part in np.meshgrid(empty.x, empty.y))
     surface = LocalQuadratic(points, side)
     height = surface.at(x, y).value.reshape(shape)
+    if not np.any(np.isfinite(height)):
+        raise DataError(
+            f"a spacing of {quantity(side, 'm')} is finer than the points are apart, and leaves a "
+            "map without a height; widen it"
+        )
     grid = HeightGrid(height=height, x0=x0, y0=y0, dx=side, dy=side)
     return Resampled(grid, surface.method_error(x, y))

@@ -41,10 +41,15 @@ def spiral_offsets(found: Compensation, feed: float, per_turn: int) -> ToolPath:
     """Return the offsets along a spiral of ``feed`` [m] a turn, at ``per_turn`` places of each.
 
     At C the part's point under the tool at X is x = X cos C, y = −X sin C, as everywhere here.
-    Raises ConfigurationError for more places than a controller takes.
+    Raises ConfigurationError for more places than a controller takes, or less than a turn.
     """
     known_row, known_column = np.nonzero(np.isfinite(found.offset))
     rim = float(np.max(np.hypot(found.x[known_column], found.y[known_row])))
+    if feed > rim:
+        raise ConfigurationError(
+            f"spiral of {quantity(feed, 'm')} a turn from a rim of {quantity(rim, 'm')} makes not "
+            "one turn; take a narrower feed"
+        )
     places = rim / feed * per_turn
     if places > _MOST_LINES:
         raise ConfigurationError(

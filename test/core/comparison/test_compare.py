@@ -115,6 +115,21 @@ def test_an_uncertainty_larger_than_the_part_tells_nothing():
     assert "more than all that is compared" in found.verdict.reasons[0]
 
 
+def test_an_uncertainty_in_a_wrong_unit_is_larger_than_the_part():
+    """Five metres for five nanometres: terms beside them have no covariance but rounding."""
+    found = compare(mapped(common=5.0), mapped(common=5.0, seed=3))
+    assert found.verdict.verdict == CANNOT_TELL
+    assert "more than all that is compared" in found.verdict.reasons[0]
+
+
+@pytest.mark.parametrize("freedom", ["x", "clocking"])
+def test_a_shift_alone_is_fitted(freedom):
+    moved = mapped(**({"shift": (80e-6, 0.0)} if freedom == "x" else {"turn": 7e-3}), common=1e-9)
+    found = compare(mapped(common=1e-9), moved, (freedom,))
+    size = {"x": -80e-6, "clocking": -7e-3}[freedom]
+    assert found.matched.moved[freedom] == pytest.approx(size, abs=0.1 * abs(size))
+
+
 def test_a_scratch_that_no_zernike_term_sees_is_found():
     def scratch(x, y):
         return 60e-9 * np.exp(-((x - 1e-3) ** 2 + (y + 2e-3) ** 2) / (2 * (0.25e-3) ** 2))

@@ -215,3 +215,8 @@ def test_a_table_for_the_controller_is_in_millimetres_and_degrees():
 def test_more_places_than_a_controller_takes_are_refused_by_their_number():
     with pytest.raises(ConfigurationError, match=r"1.00 µm a turn with 720 places .* wider feed"):
         spiral_offsets(plane(), 1e-6, 720)
+
+
+def test_a_feed_in_a_wrong_unit_makes_no_turn_and_is_refused():
+    with pytest.raises(ConfigurationError, match=r"100 mm a turn .* makes not one turn"):
+        spiral_offsets(plane(), 0.1, 360)
