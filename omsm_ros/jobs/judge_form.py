@@ -13,6 +13,7 @@ from omsm_ros.core.form.conformity import conformity
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.freedoms import MOVES
 from omsm_ros.core.registration.placement import FREEDOMS, Aperture
+from omsm_ros.core.surface.deviation import unlike
 from omsm_ros.jobs.measured_portions import Measurement
 from omsm_ros.storage.files import (
     CLOUD,
@@ -51,7 +52,7 @@ def judge_form(
     Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
     """
     form = measured.form(surface, asked, aperture, filters)
-    facts = form_facts(form, measured)
+    facts = form_facts(form, measured, surface)
     if tolerance is not None:
         found = conformity(form.deviation["robust_peak_to_valley"], tolerance)
         facts["conformity"] = found.entry() if found else None
@@ -81,7 +82,7 @@ def _deviations(form: Form) -> np.ndarray[Any, np.dtype[np.void]]:
     return table
 
 
-def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
+def form_facts(form: Form, measured: Measurement, nominal: Surface) -> dict[str, Any]:
     """Return the content of ``form.json``; lengths in metres, angles in radians."""
     found = form.registration
     placement = found.placement
@@ -101,7 +102,11 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
                 for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
-            "notes": [*measured.notes, *_advice(form)],
+            "notes": [
+                *measured.notes,
+                *_unlike(form, nominal),
+                *_advice(form),
+            ],
         },
         "aperture": {
             "radius": form.aperture.radius,
@@ -114,6 +119,11 @@ def form_facts(form: Form, measured: Measurement) -> dict[str, Any]:
         },
         "points": _counts(form, measured.missing),
     }
+
+
+def _unlike(form: Form, nominal: Surface) -> list[str]:
+    x, y = form.map.x, form.map.y
+    return unlike(x, y, nominal.height(x, y) + form.map.deviation, nominal)
 
 
 def _counts(form: Form, missing: int) -> dict[str, int]:

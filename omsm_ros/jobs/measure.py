@@ -23,6 +23,7 @@ from omsm_ros.core.dynamics.latency import latency_of
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.surface.deviation import unlike
 from omsm_ros.errors import DataError
 from omsm_ros.jobs.correct_bag import Correction, correct_bag
 from omsm_ros.jobs.corrected_scan import Admission, ByStamps
@@ -98,6 +99,13 @@ def measure(
     return summary
 
 
+def _unlike(done: Correction, nominal: Surface | None) -> list[str]:
+    if nominal is None:
+        return []
+    x, y = (done.points[name].astype(np.float64) for name in "xy")
+    return unlike(x, y, done.points["height"], nominal)
+
+
 def _publish(
     bag: Path,
     out: Path,
@@ -168,6 +176,7 @@ def summarise(
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
+    summary["warnings"] += _unlike(done, judgement.options.surface)
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
 

@@ -16,10 +16,16 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
 from omsm_ros.least_squares import least_squares
-from omsm_ros.readable import plain
+from omsm_ros.readable import plain, quantity
 
 # Of a ring of a profile, each seen once at least: form of up to five waves around averages out.
 _SECTORS = 12
+# A radius off by a third, a sign, a unit or a place; form errors are a hundredth of a shape.
+_UNLIKE = 0.3
+# Of a nearly flat part the form itself may be more than its shape.
+_PLAINLY_M, _ROUNDING_M = 0.2e-6, 1e-12
+# So many points tell what a shape is.
+_ENOUGH_POINTS = 20_000
 # Three numbers each: 12 MB.
 _MOST_WEIGHED = 2**19
 # Beyond this a spacing is a mistaken unit, and its rings would not fit into memory.
@@ -93,6 +99,32 @@ def level(
     root = np.sqrt(weight)
     fitted = least_squares(design * root[:, np.newaxis], deviation * root)
     return np.asarray(deviation - design @ fitted, np.float64)
+
+
+def unlike(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> list[str]:
+    """Return what says that points are not of ``nominal``, in words for people, or nothing.
+
+    x, y, height: [m], each (n,), in the frame of the surface
+    A measurement with a wrong sign, unit or place deviates by as much as the shape itself. What
+    has no shape, a plane, cannot be told so.
+    """
+    every = max(-(-len(x) // _ENOUGH_POINTS), 1)
+    x, y, height = x[::every], y[::every], height[::every]
+    expected = nominal.height(x, y)
+    here = np.isfinite(height - expected)
+    if np.sum(here) < 3:
+        return []
+    left, shape = (
+        float(np.sqrt(np.mean(level(x[here], y[here], values[here], tilt=True) ** 2)))
+        for values in (height - expected, expected)
+    )
+    if shape < _ROUNDING_M or left < max(_UNLIKE * shape, _PLAINLY_M):
+        return []
+    return [
+        f"the points depart from the nominal surface by {quantity(left, 'm')} rms beside a tilt, "
+        f"and that from a plane by {quantity(shape, 'm')}: they are not of this surface, or lie "
+        "elsewhere on it; check its parameters, and sign, unit and zero of each axis"
+    ]
 
 
 def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:

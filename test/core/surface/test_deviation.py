@@ -246,3 +246,30 @@ def test_areas_count_by_their_ratio_alone():
     )
     by_hand = np.sqrt((1 * 1 + 2 * 4 + 3 * 16) / 6) * 1e-9
     assert expected.rms_area_weighted == pytest.approx(by_hand)
+
+
+def seated(x, y):
+    """A part that is tilted and lies 3 mm off: neither is said to be another surface."""
+    return 3e-3 + 0.01 * x - 0.02 * y
+
+
+@pytest.mark.parametrize("shape", [PAPER_MIRROR, Sphere(radius=0.2), Flat(level=1e-3)])
+def test_points_of_the_surface_with_errors_of_form_are_not_called_others(spiral, shape):
+    x, y = spiral
+    height = shape.height(x, y) + seated(x, y) + zernike(x, y, 2, 1e-6)
+    assert form.unlike(x, y, height, shape) == []
+
+
+@pytest.mark.parametrize("radius", [-0.2, 0.13, 0.4, 200.0])
+def test_a_wrong_radius_sign_or_unit_is_told_with_both_sizes(spiral, radius):
+    x, y = spiral
+    (said,) = form.unlike(x, y, Sphere(radius=0.2).height(x, y), Sphere(radius=radius))
+    left = form.level(x, y, x**2 + y**2, tilt=True) * (1 / 0.4 - 0.5 / radius)
+    number, unit = said.split(" by ")[1].split()[:2]
+    assert unit == "µm"
+    assert float(number) == pytest.approx(1e6 * np.sqrt(np.mean(left**2)), rel=0.01)
+
+
+def test_a_handful_of_points_says_nothing():
+    nothing = np.zeros(2)
+    assert form.unlike(nothing, nothing, nothing + 1.0, PAPER_MIRROR) == []
