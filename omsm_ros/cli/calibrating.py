@@ -198,7 +198,7 @@ def _placed(text: str) -> tuple[Path, str, float]:
         raise argparse.ArgumentTypeError(
             f"{quantities.shown(text)} has no place, expected such as CAL.json@x=0.01 (x, z or b)"
         )
-    kind = quantities.ANGLE if found["axis"] == "b" else quantities.POSITION
+    kind = quantities.TABLE_ANGLE if found["axis"] == "b" else quantities.POSITION
     return Path(found["path"]), found["axis"], number(kind)(found["position"])
 
 

@@ -12,13 +12,14 @@ from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected
 from omsm_ros.cli.measuring import CALIBRATION
 from omsm_ros.cli.printing import table, written
 from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
-from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
+from omsm_ros.core.dynamics.latency import beyond_lag, declared, latency_of, with_latency
 from omsm_ros.core.verification.resolved_calibration import undetermined
 from omsm_ros.core.verification.self_calibration import (
     DEFAULT_CLOCKING_RAD,
     DEFAULT_HARMONICS,
     WIDE_GAIN,
 )
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.study_scans import (
     SelfCalibrationOptions,
     reversal_of,
@@ -195,6 +196,8 @@ def _declare_latency(sub: argparse.ArgumentParser) -> None:
 def _latency(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     lag = calibration.dynamics.low_frequency_delay
+    if (wrong := beyond_lag(calibration, args.delay, args.uncertainty)) is not None:
+        raise ConfigurationError(wrong)
     latency = declared(lag, args.delay, args.uncertainty, args.reason)
     made = with_latency(calibration, latency)
     path = _kept(args.out, made)

@@ -19,7 +19,7 @@ from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.dynamics.calibration import Calibration, age_at
 from omsm_ros.core.dynamics.discretisation import discretise
 from omsm_ros.core.dynamics.discretisation_error import discretisation_error
-from omsm_ros.core.dynamics.latency import latency_of
+from omsm_ros.core.dynamics.latency import beyond_lag, latency_of
 from omsm_ros.core.machine.surface_height import Surface
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.samples.blocks import FloatArray
@@ -177,6 +177,8 @@ def summarise(
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
     summary["warnings"] += _unlike(done, judgement.options.surface)
+    if (late := beyond_lag(calibration, judgement.options.lateral_lag or 0.0)) is not None:
+        summary["warnings"].append(late)
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
 

@@ -207,13 +207,25 @@ def _told(future: Future[Entry], task: Task) -> Entry:
         return Entry(task.bag, task.folder, task.fingerprint, CRASHED, why)
 
 
+def _state(file: Path) -> tuple[str, int, int]:
+    """Return by what a file is known as it was: name, size and time; of a dangling link the name.
+
+    Whoever corrects it says what is wrong, at the cost of that bag alone.
+    """
+    try:
+        found = file.stat()
+    except OSError:
+        return file.name, 0, 0
+    return file.name, found.st_size, found.st_mtime_ns
+
+
 def _task(
     bag: Path, folder: Path, calibration: Path, out: Path, options: Sequence[str], sign: list[str]
 ) -> Task:
     name = bag.relative_to(folder)
     result = name.with_suffix("") if bag.is_file() and not _is_bag(bag.with_suffix("")) else name
     files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
-    states = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    states = [_state(file) for file in files]
     fingerprint = hashlib.sha256(repr((states, sign)).encode()).hexdigest()
     place = str((out / result).absolute())
     command = ("correct", str(bag.absolute()), "--calibration", str(calibration.absolute()))

@@ -115,6 +115,9 @@ def test_a_latency_is_declared_with_a_reason(capsys, tmp_path, calibration):
     assert calibration_file.load_calibration(out).certificate["latency"]["delay_s"] == 1e-4
     assert cli.main([*map(str, given), "--reason", " "]) == 2
     assert "needs a reason" in capsys.readouterr().err
+    given[3] = "0.1"
+    assert cli.main([*map(str, given), "--reason", "data sheet"]) == 2
+    assert "100 ms is more than the whole lag of Z" in capsys.readouterr().err
 
 
 def test_reversal_writes_what_it_found(capsys, tmp_path, sum_of_lags):

@@ -78,6 +78,12 @@ def test_every_bag_has_a_result_of_its_own(shop, corrected, tmp_path, names):
     assert len({e.folder for e in entries}) == len(names)
 
 
+def test_a_link_to_nowhere_costs_no_other_bag(shop, corrected, tmp_path):
+    folder = shop("a.mcap", "c.mcap")
+    (folder / "b.mcap").symlink_to("unmounted.mcap")
+    assert [e.bag for e in run(tmp_path)] == ["a.mcap", "b.mcap", "c.mcap"]
+
+
 def test_parts_of_a_bag_and_results_are_no_bags(shop, corrected, tmp_path):
     folder = shop("a/", "b.mcap", "notes.txt", "c.bag", "deep/er/d.mcap")
     (folder / "out").mkdir()

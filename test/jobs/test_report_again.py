@@ -47,6 +47,16 @@ def test_it_is_the_page_of_the_correction(shop, capsys):
     assert without_date(page.read_text()) == without_date(first)
 
 
+def test_another_nominal_surface_is_refused(shop, tmp_path, capsys):
+    folder = shutil.copytree(shop / "result", tmp_path / "result")
+    (tmp_path / "other.yaml").write_text("shape: sphere\nradius: 0.1\n")
+    given = ["--calibration", str(shop / "cal.json"), "--nominal", str(tmp_path / "other.yaml")]
+    before = (folder / "report.html").read_bytes()
+    assert cli.main(["report", str(folder), *given]) == 2
+    assert "from the one that it was corrected with" in capsys.readouterr().err
+    assert (folder / "report.html").read_bytes() == before
+
+
 def test_a_rate_that_was_overridden_is_drawn_over_its_own_time(
     tmp_path, small_scan_blocks, true_calibration
 ):

@@ -22,7 +22,7 @@ from omsm_ros.core.dynamics.latency import (
 )
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.errors import CalibrationError
-from omsm_ros.quantities import ANGLE, POSITION
+from omsm_ros.quantities import POSITION, TABLE_ANGLE
 
 SET_SCHEMA = "omsm-calibration-set/1"
 AXES = ("x", "z", "b")
@@ -92,7 +92,7 @@ def calibration_set(
             f"a set of {len(placed)} calibrations, expected 2 to {MOST_MEMBERS}; calibrate at "
             "both ends of the range at least"
         )
-    quantity = ANGLE if along == "b" else POSITION
+    quantity = TABLE_ANGLE if along == "b" else POSITION
     for position, _ in placed:
         quantity.checked(position, CalibrationError, along)
     ordered = sorted(placed, key=lambda pair: pair[0])

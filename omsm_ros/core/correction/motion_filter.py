@@ -8,7 +8,7 @@ no number. The samples in which a wrong start would still be felt are marked as 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -25,7 +25,7 @@ from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, 
 from omsm_ros.core.dynamics.recursion import START_SAMPLES, Recursion, past_motion
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.samples.accounts import Reason
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.samples.blocks import BoolArray, CountingOn, FloatArray
 from omsm_ros.core.samples.pairing import Run
 
 # The share of a wrong start that may be left in the first published point.
@@ -194,6 +194,7 @@ class MotionFilter:
         self._blend = blend
         lateral = filters[0].lateral
         self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
+        self._turned = CountingOn()
         settling = max(each.settling_samples() for each in filters)
         self._start_samples = max(settling // 2, START_SAMPLES)
         self._settling = max(settling, self._start_samples)
@@ -232,7 +233,16 @@ class MotionFilter:
         self._unsettled = self._settling
         return [self._unfiltered(run, Reason.SETTLING) for run in short]
 
+    def _counting_on(self, run: Run) -> Run:
+        """Return the run with C counting on, as what delays it needs it."""
+        c = run.values[_C]
+        if (turned := self._turned.of(c)) is c:
+            return run
+        return replace(run, values=np.concatenate([run.values[:_C], turned[np.newaxis]]))
+
     def _push_finite(self, run: Run) -> list[Run]:
+        if self._lateral:
+            run = self._counting_on(run)
         if self._unsettled < self._settling:
             return [self._filtered(run)]
         self._waiting.append(run)

@@ -30,6 +30,9 @@ _SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SC
 _POWER = 1.645
 # The families whose omission bends the response itself.
 _BENDING = (MODE, STIFFENING)
+HIDING = (CREEP, *_BENDING)
+"""Every family that may hide in a test, by which priors are named."""
+
 # Decades of time between a structure's slowest motion and the length of a record.
 _DECADES = 3.0
 # What creeps within the record creeps on beyond it, about as much in each of three decades from

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from math import sqrt
+from math import hypot, sqrt
 from typing import TYPE_CHECKING, Any
 
 from omsm_ros.errors import CalibrationError, ConfigurationError, OmsmError
 from omsm_ros.quantities import LAG, SHARE, TIME_UNCERTAINTY, shown
+from omsm_ros.readable import quantity
 
 if TYPE_CHECKING:
     from omsm_ros.core.dynamics.calibration import Calibration
@@ -22,6 +23,8 @@ ENTRY = "latency"
 UNRESOLVED, REVERSAL, SPEEDS, DECLARED = "unresolved", "reversal", "several speeds", "declared"
 SOURCES = (UNRESOLVED, REVERSAL, SPEEDS, DECLARED)
 
+# Standard uncertainties by which a delay may be longer than the lag that it is a part of.
+_CLEARLY = 3.0
 REMEDY = (
     "scan the part at two spindle speeds and run 'omsm selfcal', or in both directions and run "
     "'omsm reversal', or declare it with 'omsm latency'"
@@ -122,6 +125,24 @@ def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Laten
         share=share_of(delay, lag),
         source=DECLARED,
         reason=reason,
+    )
+
+
+def beyond_lag(calibration: Calibration, delay: float, uncertainty: float = 0.0) -> str | None:
+    """Return what is wrong with a ``delay`` ± ``uncertainty`` [s] beyond the whole lag of Z.
+
+    What is left of the lag would be a structure that moves before its slide.
+    """
+    lag, spread = (
+        calibration.dynamics.low_frequency_delay,
+        calibration.low_frequency_delay_uncertainty,
+    )
+    if delay <= max(lag, 0.0) + _CLEARLY * hypot(spread, uncertainty):
+        return None
+    return (
+        f"a delay of the probe of {quantity(delay, 's')} is more than the whole lag of Z, "
+        f"{quantity(lag, 's')} ± {quantity(spread, 's')}: give the probe's delay against the "
+        "slides, in seconds"
     )
 
 

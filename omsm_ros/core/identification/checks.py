@@ -30,6 +30,10 @@ _LEAST_CHI_SQUARE = 0.3
 _LEAST_TRUSTED_HZ = 5.0
 # Standard uncertainties beyond which a lead is no chance.
 _CLEARLY = 5.0
+# Exposure, averaging and transmission of a probe take milliseconds, of a slow one some samples.
+_LONGEST_LAG_S, _LONGEST_LAG_SAMPLES = 0.1, 5.0
+# Linear probes keep a per cent, and see Z at 10° as 0.985.
+_SCALE_OFF = 0.05
 
 
 def misfit(
@@ -105,6 +109,32 @@ def lead(lag: float, uncertainty: float, encoder_noise: float, probe_noise: floa
         reservations=(
             f"{early}: the encoder is read late; latch both by one trigger, or keep it exactly so "
             "in the scan",
+        )
+    )
+
+
+def late(lag: float, period: float) -> Finding:
+    """Reserve a probe that answers later than probes do, by ``lag`` [s] at ``period`` [s]."""
+    if lag < max(_LONGEST_LAG_S, _LONGEST_LAG_SAMPLES * period):
+        return Finding()
+    return Finding(
+        reservations=(
+            f"the probe answers {quantity(lag, 's')} after the encoder, {plain(lag / period)} "
+            "samples, longer than probes and structures take: their counters or clocks are off by "
+            "as much; restart both drivers together, or keep them exactly so in the scan",
+        )
+    )
+
+
+def scale(gain: float) -> Finding:
+    """Reserve a static ``gain`` [1] that no probe has before an encoder that is right."""
+    if abs(gain - 1) < _SCALE_OFF:
+        return Finding()
+    return Finding(
+        reservations=(
+            f"the probe shows {plain(gain)} of the travel of Z, where probes keep a per cent: "
+            "check counts_per_unit of Z, where an error is one of every height, the scale of the "
+            "probe, and its angle to Z",
         )
     )
 
@@ -199,6 +229,8 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
         e.prepared.steps.noise,
         e.residual.noise,
     ),
+    lambda e: late(e.dynamics.low_frequency_delay, e.prepared.problem.period),
+    lambda e: scale(abs(e.fit.gain)),
     lambda e: timing(e.residual.timing, e.residual.axis_timing),
     lambda e: two_clocks(e.record.by_stamps),
     lambda e: departures(e.searched),

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from omsm_ros.core.departures.families import CREEP, MODE
-from omsm_ros.core.departures.hidden import HiddenTerm, hidden_terms, with_slower_creep
+from omsm_ros.core.departures.hidden import HIDING, HiddenTerm, hidden_terms, with_slower_creep
 from omsm_ros.core.departures.other_modes import spread_of_modes
 from omsm_ros.core.departures.survey import Survey
 from omsm_ros.core.departures.term import Term
@@ -23,6 +23,7 @@ from omsm_ros.core.fitting.output_error import Fit
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.identification.finding import Finding
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import shown
 from omsm_ros.readable import number, percent, quantity
 
 
@@ -39,7 +40,7 @@ def hidden_covariance(
     settings: with "priors", an object of standard uncertainties by the name of a family, a
         term is taken no larger than its prior
 
-    Raises ConfigurationError for a prior that is no positive number.
+    Raises ConfigurationError for a prior of another family, or that is no positive number.
     """
     priors = _priors(settings)
     terms = hidden_terms(survey, drift)
@@ -122,6 +123,11 @@ def _priors(settings: Mapping[str, object]) -> dict[str, float]:
     if not isinstance(stated, Mapping):
         raise ConfigurationError(f"settings: priors is {stated!r}, expected an object")
     for name, value in stated.items():
+        if name not in HIDING:
+            raise ConfigurationError(
+                f"settings: the prior of {shown(name)} is unknown, expected one of "
+                f"{', '.join(map(repr, HIDING))}"
+            )
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
             raise ConfigurationError(
                 f"settings: the prior of {name!r} is {value!r}, expected a positive number"

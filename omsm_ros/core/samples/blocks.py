@@ -34,6 +34,9 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 # No device here delivers more in one message; a longer block is a forgery or a wrong unit.
 MAX_BLOCK_SAMPLES = 4_000_000
 
+# Of fewer steps the median may be the jump itself.
+_STEPS_TOLD = 5
+
 SAME_PERIOD = 1e-6
 """Sample periods are written, not measured: alike to this part, six digits, they are one."""
 
@@ -183,3 +186,30 @@ class AccelerationBlock(Block):
 
     def __len__(self) -> int:
         return len(self.z)
+
+
+class CountingOn:
+    """An angle that counts on, of one that may begin anew on every turn [rad].
+
+    Whatever delays or interpolates C would take such a jump for a turn back. A jump is told from a
+    spindle that makes a turn from sample to sample by the steps around it.
+    """
+
+    def __init__(self) -> None:
+        self._last = np.empty(0)
+        self._steps = np.empty(0)
+
+    def of(self, angle: FloatArray) -> FloatArray:
+        """Return the next angles (n,), finite; the same array where there is nothing to count."""
+        before = np.concatenate([self._last, angle])
+        steps = np.diff(before)
+        known = np.concatenate([self._steps, steps])
+        if len(known) >= _STEPS_TOLD:
+            turns = np.round((steps - np.median(known)) / (2 * np.pi))
+            if np.any(turns):
+                steps = steps - 2 * np.pi * turns
+                before[1:] -= 2 * np.pi * np.cumsum(turns)
+                angle = before[len(self._last) :]
+        self._last = before[-1:]
+        self._steps = np.concatenate([self._steps, steps])[-_STEPS_TOLD:]
+        return angle

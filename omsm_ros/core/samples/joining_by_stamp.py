@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.samples.blocks import AxisBlock, Block, CountingOn, DistanceBlock, FloatArray
 from omsm_ros.core.samples.continuity import TriggerCount
 from omsm_ros.core.samples.merging import uninterrupted, without_first
 from omsm_ros.errors import ConfigurationError, DataError
@@ -33,6 +33,7 @@ _EXPOSURE_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
 # Sample clocks are quartz; stamps that disagree more with the stated period are wrong.
 _MAX_RATE_ERROR = 1e-3
 _AXES = ("x", "y", "z", "b", "c")
+_C = _AXES.index("c")
 
 B = TypeVar("B", AxisBlock, DistanceBlock)
 
@@ -138,6 +139,8 @@ class _Track:
         from scipy.interpolate import make_interp_spline
 
         usable = len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values)))
+        if usable:
+            values[:, _C] = CountingOn().of(values[:, _C])
         spline = make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
         return cls(run[0].stamp_ns, float(time[0]), float(time[-1]), spline)
 

@@ -135,7 +135,7 @@ def from_scans_alone(
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
         "warnings": [] if found.known[LATENCY] else [SCOPE],
-        "reasons": [],
+        "reasons": _early(total, float(np.sqrt(found.covariance[LAG, LAG]))),
         "verdict": f"accepted up to {quantity(trusted, 'Hz')}",
     }
     return Calibration(
@@ -266,11 +266,22 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
             f"the probe would have to be {quantity(-latency, 's')} early: the structure "
             "lags more in the scans than in the step test; repeat the step test"
         )
-    if not reasons:
-        return certificate
     before = certificate.get("reasons")
     all_reasons = [*(before if isinstance(before, list) else []), *reasons]
+    if not all_reasons:
+        return certificate
     return certificate | {"reasons": all_reasons, "verdict": REJECTED}
+
+
+def _early(lag: float, uncertainty: float) -> list[str]:
+    """Return the reason against scans alone whose Z would have to follow the probe."""
+    if lag >= -_SURPRISE_SIGMAS * uncertainty:
+        return []
+    return [
+        f"Z would have to move {quantity(-lag, 's')} after what the probe sees of it: the sign of "
+        "the distance (--polarity), the static gain (--static-gain) or the encoder's latch is not "
+        "as stated; make a step test, and give it (--calibration)"
+    ]
 
 
 def _highest_excited(found: SelfCalibration) -> float:

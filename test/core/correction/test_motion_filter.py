@@ -65,6 +65,33 @@ def test_axes_pass_unless_the_lag_is_latency() -> None:
     assert np.allclose(late.values[[X, Y, B, C]], delayed, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("length", [1, 2, 7, 50, 400])
+@pytest.mark.parametrize("least", [0.0, -np.pi])
+@pytest.mark.parametrize("speed", [300.0, -300.0, 2 * np.pi * 1000])
+def test_a_spindle_that_begins_anew_on_every_turn_is_delayed_alike(
+    length: int, least: float, speed: float
+) -> None:
+    """Also one that makes a whole turn from sample to sample, where nothing begins anew."""
+    once = speed > 1000
+    counting, anew = new(lateral_lag=0.4e-3), new(lateral_lag=0.4e-3)
+    both: list[list[Run]] = [[], []]
+    for first in range(0, 400, length):
+        run = uniform(first + 10, length)
+        turned = replace(run, values=run.values.copy())
+        turned.values[4] *= speed / SPEED[4]
+        wrapped = replace(turned, values=turned.values.copy())
+        if not once:
+            wrapped.values[4] = (turned.values[4] - least) % (2 * np.pi) + least
+        both[0] += counting.push(turned)
+        both[1] += anew.push(wrapped)
+    expected, found = (np.concatenate([r.values[C] for r in runs]) for runs in both)
+    # Of the first samples nobody knows which way they turn.
+    settled = slice(settling(), None)
+    assert np.allclose(np.exp(1j * found)[settled], np.exp(1j * expected)[settled], atol=1e-9)
+    lag = speed * (10 + np.arange(len(expected))) * 1e-3 - expected
+    assert np.allclose(lag, speed * 0.4e-3, rtol=0, atol=1e-7)
+
+
 def test_the_rate_is_the_speed() -> None:
     (run,) = new().push(uniform(0, 100))
     assert np.allclose(run.values[RATE], SPEED[2], rtol=1e-6)

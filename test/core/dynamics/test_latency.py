@@ -10,6 +10,7 @@ from omsm_ros.core.dynamics.calibration import Calibration
 from omsm_ros.core.dynamics.latency import (
     DECLARED,
     UNRESOLVED,
+    beyond_lag,
     declared,
     latency_of,
     unresolved,
@@ -64,3 +65,15 @@ def test_what_cannot_be_declared_is_refused(
 ) -> None:
     with pytest.raises(ConfigurationError, match=named):
         declared(LAG, delay, uncertainty, reason)
+
+
+@pytest.mark.parametrize(("delay", "uncertainty"), [(0.0, 0.0), (LAG, 0.0), (3.2e-4, 1e-5)])
+def test_a_delay_within_the_lag_is_a_part_of_it(delay: float, uncertainty: float) -> None:
+    assert beyond_lag(KNOWN, delay, uncertainty) is None
+
+
+@pytest.mark.parametrize(("delay", "uncertainty"), [(0.1, 1e-5), (3.2e-4, 1e-6)])
+def test_a_delay_in_a_wrong_unit_is_more_than_the_lag(delay: float, uncertainty: float) -> None:
+    said = beyond_lag(KNOWN, delay, uncertainty)
+    assert said is not None
+    assert "is more than the whole lag of Z, 300 µs ± 0 s" in said

@@ -7,9 +7,11 @@ import pytest
 from omsm_ros.core.dynamics.response_band import ResponseLimits
 from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.checks import (
+    late,
     misfit,
     poles_beyond,
     requested_order,
+    scale,
     separable_gain,
     trusted_range,
     two_clocks,
@@ -25,6 +27,20 @@ def test_two_clocks_are_a_reservation():
     assert not two_clocks(False).reservations
     (said,) = two_clocks(True).reservations
     assert "part of the lag" in said
+
+
+def test_a_probe_that_is_later_than_probes_are_is_reserved():
+    assert not late(60e-3, 1e-3).reservations
+    assert not late(0.3, 0.1).reservations
+    (said,) = late(1.00034, 1e-3).reservations
+    assert "1.00 s after the encoder, 1.00 · 10³ samples" in said
+
+
+@pytest.mark.parametrize("gain", [0.902, 1.1])
+def test_a_scale_that_no_probe_has_is_reserved(gain):
+    assert not scale(0.992).reservations
+    (said,) = scale(gain).reservations
+    assert "counts_per_unit of Z" in said
 
 
 def test_good_evidence_gives_no_reason_and_no_warning():

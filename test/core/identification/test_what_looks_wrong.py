@@ -9,7 +9,7 @@ from omsm_ros.core.identification.checks import lead
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.errors import IdentificationError
+from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD = 1e-3
 TIME = np.arange(0.0, 15.0, PERIOD)
@@ -81,3 +81,12 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
     assert found.calibration.certificate["verdict"] == "rejected"
     # 1500, and what was begun by then.
     assert 1000 < found.prepared.problem.effort.comparisons < 2200
+
+
+@pytest.mark.parametrize("name", ["Creep", "crep", "backlash"])
+def test_a_prior_of_what_does_not_hide_is_refused(name):
+    rng = np.random.default_rng(1)
+    z = StepTest(count=2).positions(TIME).z
+    record = MotionRecord.from_arrays(PERIOD, z, rng.normal(-z, 10e-9))
+    with pytest.raises(ConfigurationError, match="is unknown, expected one of 'creep'"):
+        identify(record, settings={"priors": {name: 1e-6}})
