@@ -1,6 +1,7 @@
-"""How a program ends that is asked to while it only loads: at once, and without a traceback.
+"""What a program settles before it loads: how it ends until then, and its threads.
 
-It imports nothing that takes time: what loads before its handlers are in force has none.
+Asked to end while it only loads, it does at once, and without a traceback. Nothing is imported here
+that takes time: what loads before its handlers are in force has none.
 """
 
 from __future__ import annotations
@@ -12,6 +13,14 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 STDERR = 2
+# Of BLAS, which takes one of each core for a sum over a long array: they wait for each other, on a
+# busy computer for ten times as long as the sum takes, and sums depend on how many there are.
+_THREADS = "OMP_NUM_THREADS"
+
+
+def one_thread_of_blas() -> None:
+    """Let BLAS, once it is loaded, compute in the thread that asks, unless the user has chosen."""
+    os.environ.setdefault(_THREADS, "1")
 
 
 @contextmanager

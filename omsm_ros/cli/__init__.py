@@ -8,27 +8,23 @@ standard output holds one JSON object and nothing else.
 from __future__ import annotations
 
 import gc
-import os
 import signal
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 
-from omsm_ros.loading import nothing_to_undo
+from omsm_ros.loading import nothing_to_undo, one_thread_of_blas
 
 INTERRUPTED = 130
 INTERRUPTION = "interrupted; no unfinished file was left"
 # What loading brings stays to the end. Python looks through it again for each 700 new objects,
 # which took 4 to 6 per cent of a command.
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
-# Of BLAS, which takes one of each core for a sum over a long array: they wait for each other, on a
-# busy computer for as long as a command takes, and sums depend on how many there are.
-_THREADS = "OMP_NUM_THREADS"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    os.environ.setdefault(_THREADS, "1")
+    one_thread_of_blas()
     with interruptible():
         from omsm_ros.cli import command_line
     return command_line.main(arguments)

@@ -177,13 +177,11 @@ class Task:
 def correct_one(task: Task) -> Entry:
     """Correct one bag in a process of its own and say what became of it."""
     found = REFUSED, "not started"
-    # Each core has a bag of its own; threads of BLAS would only get into each other's way.
-    alone = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **os.environ}
     for _ in range(_ATTEMPTS):
         try:
             done = subprocess.run(
                 [sys.executable, "-m", "omsm_ros.cli", *task.command],
-                stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, env=alone,
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
             )  # fmt: skip
         except OSError as err:
             found = CRASHED, said(err)

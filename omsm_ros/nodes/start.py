@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
-from omsm_ros.loading import nothing_to_undo
+from omsm_ros.loading import nothing_to_undo, one_thread_of_blas
 from omsm_ros.nodes.memory import share_one_pool
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -50,6 +50,7 @@ def main() -> None:
     _check_open_files(name)
     with nothing_to_undo(ENDING):
         share_one_pool(ENDING)  # first, for the process may begin again
+        one_thread_of_blas()
         end_with_launch()
         set_up_fast_dds()
         for package, remedy in _NEEDED.items():

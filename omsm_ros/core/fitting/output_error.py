@@ -50,6 +50,7 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
+    unfollowed: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
     effort: what was tried of this problem, and of those made of it
     """
 
@@ -63,6 +64,7 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
+    unfollowed: FloatArray | None = None
     effort: Effort = field(default_factory=Effort)
 
     @cached_property

@@ -139,6 +139,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
         plateau=None,
+        unfollowed=None,
     )
 
 

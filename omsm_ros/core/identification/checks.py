@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from omsm_ros.core.dynamics.response_band import (
     COVERAGE_FACTOR,
     ResponseLimits,
@@ -20,6 +22,7 @@ from omsm_ros.core.identification.covariance_terms import HARMLESS_DELAY_S
 from omsm_ros.core.identification.departure_checks import agreement, departures, independence
 from omsm_ros.core.identification.evidence import Evidence
 from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.samples.blocks import FloatArray
 from omsm_ros.readable import percent, plain, quantity
 
 # A residual this much larger than the noise is not noise; its square is χ² per sample.
@@ -34,6 +37,8 @@ _CLEARLY = 5.0
 _LONGEST_LAG_S, _LONGEST_LAG_SAMPLES = 0.1, 5.0
 # Linear probes keep a per cent, and see Z at 10° as 0.985.
 _SCALE_OFF = 0.05
+# Of the variance of the probe's noise; the heights of a scan are noisier by a twentieth.
+_WORTH_TELLING = 0.1
 
 
 def misfit(
@@ -72,6 +77,27 @@ def timing(scatter: float, of_axis: float = 0.0) -> Finding:
             for whose, found in (("", scatter), (" of the axis", of_axis))
             if found > 0
         ),
+    )
+
+
+def encoder_noise(unfollowed: FloatArray | None, noise: float) -> Finding:
+    """Tell of noise that was ``unfollowed`` by the probe, (n,) [m], and taken out of the input.
+
+    noise: standard deviation of a reading of the probe [m]; what adds little to it is not warned of
+    """
+    if unfollowed is None:
+        return Finding({"encoder_noise_m": None})
+    found = float(np.sqrt(np.mean(unfollowed**2)))
+    worth_telling = found**2 > _WORTH_TELLING * noise**2
+    return Finding(
+        {"encoder_noise_m": found},
+        warnings=(
+            f"the positions of the axis have noise of {quantity(found, 'm')} (rms) that the probe "
+            "did not follow; the response is fitted without it, but each height of a scan has it: "
+            "check the signals of the encoder and their shielding",
+        )
+        if worth_telling
+        else (),
     )
 
 
@@ -232,6 +258,7 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: late(e.dynamics.low_frequency_delay, e.prepared.problem.period),
     lambda e: scale(abs(e.fit.gain)),
     lambda e: timing(e.residual.timing, e.residual.axis_timing),
+    lambda e: encoder_noise(e.prepared.problem.unfollowed, e.residual.noise),
     lambda e: two_clocks(e.record.by_stamps),
     lambda e: departures(e.searched),
     lambda e: independence(

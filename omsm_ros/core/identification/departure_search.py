@@ -26,6 +26,7 @@ from omsm_ros.core.departures.families import (
 from omsm_ros.core.departures.survey import Judged, Survey
 from omsm_ros.core.departures.term import Term
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
+from omsm_ros.core.fitting.encoder_noise import without_unfollowed
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
 from omsm_ros.core.fitting.order_choice import choose as choose_candidate
@@ -128,13 +129,23 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
 def _first(prepared: Prepared, choose: Choose) -> tuple[Prepared, list[ModelledTerm], Model]:
     """Return the problem and its model, beside what shows first or what its poles imitate."""
     prepared, beside = _with_columns(prepared, _drift(prepared))
-    prepared, model = choose(prepared)
+    prepared, model = _quieter(*choose(prepared), choose)
     columns = _imitated(prepared, model)
     if columns:
         prepared, added = _with_columns(prepared, columns, beside)
         beside += added
         prepared, model = choose(prepared)
     return prepared, beside, model
+
+
+def _quieter(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
+    """Return both without the encoder's own noise, if that describes more."""
+    problem = without_unfollowed(prepared.problem, model.chosen.fit)
+    if problem is None:
+        return prepared, model
+    quieter, found = choose(replace(prepared, problem=problem))
+    better = information(found.chosen.fit) < information(model.chosen.fit)
+    return (quieter, found) if better else (prepared, model)
 
 
 def _drift(prepared: Prepared) -> list[Judged]:
@@ -149,9 +160,8 @@ def _drift(prepared: Prepared) -> list[Judged]:
 
 
 def _shown_drift(survey: Survey) -> list[Judged]:
-    return [
-        judged for judged in _beside(survey, survey.significant()) if judged.term.family == DRIFT
-    ]
+    shown = _beside(survey, survey.significant())
+    return [judged for judged in shown if judged.term.family == DRIFT]
 
 
 def _imitated(prepared: Prepared, model: Model) -> list[Judged]:

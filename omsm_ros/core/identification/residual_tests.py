@@ -91,7 +91,9 @@ def _axis_timing(
     excess: of the mean square of the residual where ``moves`` (n,), over ``noise``² [m²]
     """
     rate = rate_of(problem)
-    scatter = motion_scatter(problem.input, rate)
+    # Noise that was taken out at rest only would look like scatter where the axis moves.
+    recorded = problem.input if problem.unfollowed is None else problem.input + problem.unfollowed
+    scatter = motion_scatter(recorded, rate)
     lines = np.linspace(0.0, 0.5 / problem.period, _LINES)
     passed = float(np.mean(np.abs(fitted.gain * fitted.dynamics.response(lines)) ** 2))
     makes = scatter**2 * float(np.mean(rate[moves] ** 2)) * passed

@@ -38,6 +38,7 @@ _SHOWN = {
     "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
     "valid_from", "departures", "could_hide", "hidden_mostly", "plateau_s", "assumed",
     "motion_error_m", "reservations", "timing_scatter_s", "axis_timing_scatter_s",
+    "encoder_noise_m",
     "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
     "reference_lag_uncertainty_s", "latency", "consistency", RECORDED,
 }  # fmt: skip
