@@ -148,7 +148,7 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
     elif args.output is not None or args.period is not None:
         raise ConfigurationError(
             f"--output and --period are for a table; {str(args.recording)!r} is no {TABLE_SUFFIX} "
-            "file, and a bag knows both"
+            "file, and a bag knows both: leave them out"
         )
 
 

@@ -233,7 +233,9 @@ class PlayerNode(ManagedNode):
         if self._wanted:
             raise OmsmError("it is playing; call pause before step")
         if self._next is None or not self._listeners.room:
-            raise OmsmError("there is no next message, or the last ones have not been taken")
+            raise OmsmError(
+                "there is no next message, or the last ones have not been taken; ask again"
+            )
         topic, stamp, _ = self._next
         self._publish_next()
         self._playback.go_to(stamp, time.monotonic())

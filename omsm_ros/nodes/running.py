@@ -97,7 +97,7 @@ def _check_parameter_file(path: Path) -> None:
     # A pipe has been read by now.
     if path.is_file() and not strict_yaml.begins_as_mapping(path.read_bytes()):
         raise ConfigurationError(
-            f"{str(path)!r} is no file of parameters: one begins with the name of a node, or "
+            f"{str(path)!r} is no file of parameters: it must begin with the name of a node, or "
             "/**, and has ros__parameters below"
         )
 

@@ -46,7 +46,8 @@ class LiveServer:
             )
         if len(token) > _LONGEST_TOKEN:
             raise ConfigurationError(
-                f"token of {len(token)} characters, at most {_LONGEST_TOKEN} fit into an address"
+                f"token of {len(token)} characters, at most {_LONGEST_TOKEN} fit into an address; "
+                "shorten it"
             )
         self._view, self._page, self._token = view, page, token
         self._host, self._wanted = host, port

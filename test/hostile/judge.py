@@ -32,7 +32,8 @@ REMEDIES = (
     "set the", "needs", "must", "state ", "thin it", "save it", "name the", "name it", "name each",
     "measure", "hold what",
     "widen", "split it", "calibrate every", "end it in", "again",
-    "correct the scan", "import the parts", "sort them",
+    "correct the scan", "import the parts", "sort them", "correct it",
+    "turn its", "take it as", "drop", "shorten", "cut them", "publish",
 )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ class TransferFunction:
         for name in ("numerator", "denominator"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
-                raise DataError(f"{name} {values!r} is not a row of finite numbers")
+                raise DataError(f"{name} {values!r} must be a row of finite numbers")
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.denominator[0] != 1.0:
@@ -88,7 +88,7 @@ class TransferFunction:
     def normalised(self) -> TransferFunction:
         """Return the same dynamics with G(0) = 1."""
         if self.dc_gain == 0:
-            raise DataError("a transfer function with G(0) = 0 cannot be normalised")
+            raise DataError("a transfer function with G(0) = 0 cannot be normalised; give another")
         return TransferFunction(self.numerator / self.dc_gain, self.denominator, self.delay)
 
     def response(self, frequency: ArrayLike) -> ComplexArray:

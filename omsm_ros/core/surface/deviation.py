@@ -178,7 +178,7 @@ class RunningStatistics:
     def statistics(self) -> FormStatistics:
         """Return the statistics of all portions so far. Raises DataError if there was none."""
         if not self._points:
-            raise DataError("0 points: there is nothing to take statistics of")
+            raise DataError("0 points: there is nothing to take statistics of; give one or more")
         x, y, shifted = self._weighed.rows().T
         weights = area_weights(x, y)
         piston = float(np.average(shifted, weights=weights))
@@ -265,7 +265,7 @@ def _check(**arrays: FloatArray) -> None:
         raise DataError(f"form: arrays of shapes {lengths!r}, expected one row of one length each")
     for name, array in arrays.items():
         if not len(array):
-            raise DataError(f"form: {name} is empty")
+            raise DataError(f"form: {name} is empty; give one point or more")
         bad = int(np.sum(~np.isfinite(array)))
         if bad:
             raise DataError(

@@ -105,7 +105,9 @@ class TdmsTable(ForeignTable):
             raise self._damaged(err) from err
         if dated != (values.dtype.kind == "M"):
             holds = "numbers" if dated else "dates"
-            raise FileError(f"{self} has {holds} in {name!r}; its unit in the map says otherwise")
+            raise FileError(
+                f"{self} has {holds} in {name!r}; its unit in the map says otherwise: correct it"
+            )
         if dated:  # always UTC
             since = values.astype("datetime64[ns]").astype(np.int64)
             return np.asarray(since / NANOSECONDS_PER_S)

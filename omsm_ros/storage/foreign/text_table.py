@@ -121,7 +121,8 @@ class TextTable(ForeignTable):
         """Return the cells of the line of names, which alone may hold delimiters in quotes."""
         if len(line) > _MAX_LINE_CHARACTERS:
             raise FileError(
-                f"{self} has {len(line)} characters in a line; it is no table of numbers"
+                f"{self} has {len(line)} characters in a line; give a table of numbers, one row a "
+                "line"
             )
         cells = self._cells(line)
         if '"' in line and self._form.delimiter != " ":

@@ -134,7 +134,7 @@ class TopicTable(ForeignTable):
             if absent:
                 raise FileError(
                     f"{self}, message {number}: it has no {absent[0]!r}, but others of the map's "
-                    "columns; axes are latched together and come in one message"
+                    "columns; publish axes that are latched together in one message"
                 )
             rows.append(found)  # type: ignore[arg-type]
             if len(rows) == PIECE_ROWS:

@@ -34,7 +34,7 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
                 found = reader.topography()
             height = np.ma.filled(np.ma.asarray(found.heights(), np.float64), np.nan)
     except Exception as err:  # a reader of forty formats fails in as many ways
-        raise FileError(f"{what} is of no known format: {said(err)}") from err
+        raise FileError(f"{what} is of no known format, convert it to xyz: {said(err)}") from err
     if height.ndim != 2 or found.physical_sizes is None:
         raise FileError(f"{what} is no map with its size; convert it to xyz")
     metres = metres_in(str(found.unit)) if found.unit else None

@@ -72,7 +72,7 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
         first = _first_line(line)
         if first is None:
             raise FileError(
-                f"{what} does not begin with columns, rows (5 or more), two spacings, unit and "
+                f"{what} must begin with columns, rows (5 or more), two spacings, unit and "
                 "decentres"
             )
         if not _has_unit(first):

@@ -165,8 +165,8 @@ def test_which_first_lines_are_those_of_a_grid_sag(first, second, is_one):
     ("first", "told"),
     [
         ((1, 1, 7), "unit 7, the fifth number of its first line, expected 0 .mm., 1 .cm., 2 .inch"),
-        ((1, 1), "does not begin with columns, rows .5 or more., two spacings, unit and decentres"),
-        ((1, 0, 0), "does not begin with columns, rows"),
+        ((1, 1), "must begin with columns, rows .5 or more., two spacings, unit and decentres"),
+        ((1, 0, 0), "must begin with columns, rows"),
         ((1, 1e9, 3), "spacing dy of the map"),
         ((1, 1, 3, 1e9, 0), "x0 of the map"),
     ],
