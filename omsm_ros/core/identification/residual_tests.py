@@ -17,8 +17,7 @@ from omsm_ros.core.fitting.covariance import autoregression
 from omsm_ros.core.fitting.output_error import Fit, Problem
 from omsm_ros.core.fitting.reading_steps import reading_step
 from omsm_ros.core.fitting.steps import Steps, lasting
-from omsm_ros.core.fitting.timing_noise import motion_scatter
-from omsm_ros.core.fitting.uneven_noise import rate_of, scatter_in_time
+from omsm_ros.core.fitting.uneven_noise import motion_scatter, rate_of, scatter_in_time
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.least_squares import orthonormal
 

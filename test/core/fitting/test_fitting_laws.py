@@ -27,7 +27,7 @@ from omsm_ros.core.fitting.steps import (
     sample_noise,
     segments,
 )
-from omsm_ros.core.fitting.timing_noise import motion_scatter, timing_variance
+from omsm_ros.core.fitting.uneven_noise import motion_scatter, timing_variance
 from omsm_ros.core.samples.blocks import FloatArray
 
 PERIOD, REST, RAMP = 1e-3, 200, 40

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.fitting.timing_noise import motion_scatter, timing_variance
+from omsm_ros.core.fitting.uneven_noise import motion_scatter, timing_variance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
