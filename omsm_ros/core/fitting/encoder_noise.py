@@ -21,10 +21,9 @@ from omsm_ros.core.samples.blocks import FloatArray, IntArray
 # Width of the intervals that must have a value in common, in standard deviations. On quintic steps
 # with noise of 1 and 3 nm two leaves least: 0.15 of it, and nothing that repeats at each step.
 _INTERVAL = 2.0
-# Standard deviations beyond which a part that is followed, or is not, is no chance.
-_CLEARLY = 3.0
-# Those of one band beside dozens of others.
-_APART = 4.0
+# Standard deviations beyond which a part that is followed, or is not, is no chance. Noise that
+# shows less imitates no departure that would be significant.
+_CLEARLY = 5.0
 # Of a record's spectrum: dozens of bands, the lowest of so many lines that they tell their noise.
 _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 
@@ -69,7 +68,7 @@ def _not_followed(residual: FloatArray, made: FloatArray) -> tuple[FloatArray | 
     line = np.arange(len(expected))
     band = np.floor(np.log2(1 + line / _NARROWEST) * _BANDS_AN_OCTAVE).astype(np.int64)
     found, known_to = _shares(expected, seen, band)
-    own = np.abs(found - _weighted_median(found, 1 / known_to)) > _APART * known_to
+    own = np.abs(found - _weighted_median(found, 1 / known_to)) > _CLEARLY * known_to
     weight = np.where(own, 0.0, known_to**-2.0)
     share = np.where(own, found, np.sum(weight * found) / np.sum(weight))
     known_to = np.where(own, known_to, np.sum(weight) ** -0.5)
