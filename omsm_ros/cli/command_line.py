@@ -18,6 +18,7 @@ from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
+from omsm_ros.cli.overwriting import check_outputs
 from omsm_ros.cli.printing import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
@@ -227,6 +228,7 @@ def _split(given: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _run(args: argparse.Namespace) -> int:
+    check_outputs(args)
     if args.command == DEMO:
         return _demo(args)
     with at_work(f"omsm {args.command}", args.json):

@@ -1,0 +1,73 @@
+"""No result takes the place of what was measured, or of what it was made from."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from omsm_ros.cli import main
+from omsm_ros.cli.overwriting import check_outputs
+from omsm_ros.errors import ConfigurationError
+
+
+@pytest.fixture
+def shop(tmp_path, monkeypatch):
+    """Files by their names alone: nobody reads them here."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("steps.mcap", "older.mcap", "run.csv", "cal.json", "geo.yaml", "points.xyz"):
+        Path(name).write_text(name)
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    Path("link.mcap").symlink_to("steps.mcap")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("identify steps.mcap --out steps.mcap", "is what is read"),
+        ("identify steps.mcap --out ./link.mcap", "is what is read"),
+        ("identify steps.mcap --out older.mcap", "is a recording"),
+        ("identify run.csv --input u --output y --period 1 --out run.csv", "is what is read"),
+        ("validate cal.json run.csv --input u --output y --out run.csv", "is what is read"),
+        ("validate cal.json run.csv --input u --output y --out cal.json", "is what is read"),
+        ("export points.xyz --out points.xyz", "is what is read"),
+        ("selfcal steps.mcap older.mcap --out older.mcap", "is what is read"),
+        ("calset cal.json@x=0 cal.json@x=1 --out cal.json", "is what is read"),
+        ("align steps.mcap --calibration cal.json --radius 1 --out cal.json", "is what is read"),
+        ("history --catalogue h.sqlite --add cal.json --plot cal.json", "is what is read"),
+        ("correct bag --calibration cal.json --out bag", "is what is read"),
+        ("form points.xyz --nominal geo.yaml --out points.xyz", "is what is read"),
+    ],
+)
+def test_what_is_read_is_not_written(shop, capsys, words, said):
+    before = {path: path.read_text() for path in shop.iterdir() if path.is_file()}
+    assert main(words.split()) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert "give another name" in err
+    assert err.count("\n") == 1
+    assert {path: path.read_text() for path in shop.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("command", "given"),
+    [
+        ("latency", {"calibration": "cal.json", "out": "cal.json"}),
+        ("align", {"bag": "steps.mcap", "geometry": "geo.yaml", "out": "geo.yaml"}),
+        ("identify", {"recording": "steps.mcap", "out": "cal.json"}),
+        ("form", {"measured": "folder", "out": "folder"}),
+        ("identify", {"recording": "steps.mcap", "out": "new.json", "settings": "x" * 5000}),
+    ],
+)
+def test_a_result_may_take_the_place_of_its_like(shop, command, given):
+    (shop / "folder").mkdir()
+    check_outputs(argparse.Namespace(command=command, **{n: Path(v) for n, v in given.items()}))
+
+
+def test_a_bag_in_a_pipe_or_a_name_too_long_is_left_to_whoever_opens_it(shop):
+    check_outputs(argparse.Namespace(command="identify", out=Path("x" * 300), bag=Path("y" * 300)))
+    with pytest.raises(ConfigurationError):
+        check_outputs(argparse.Namespace(command="x", out=Path("run.csv"), bag=[("run.csv", 1.0)]))
