@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -102,6 +103,8 @@ _SAID = {
 WORDS = frozenset[str]().union(*_SAID.values(), _OF_NO_CHANNEL) - {"1"}
 """What a file may call a unit, of whatever it is; log[1] is a place."""
 
+_TIME_NAME = re.compile(r"(?:t|time|zeit)\s*(?:[_/]|[\[(]|\s)\s*(\w+)\s*[\])]?", re.IGNORECASE)
+
 # One turn in each unit that it may be counted in.
 _TURNS = {"deg": 360.0, "rad": 2 * np.pi, "mrad": 2000 * np.pi, "turn": 1.0}
 # A reading falls short of a whole turn by its own step at most.
@@ -115,6 +118,15 @@ def is_other(stated: str, unit: str, channel: str) -> bool:
     """
     known = unit in UNITS[channel] and stated in WORDS
     return known and _SAID[channel].get(stated) != UNITS[channel][unit]
+
+
+def seconds_of(name: str) -> float | None:
+    """Return what one of a column of time is in seconds, as its ``name`` says; None where none.
+
+    As "time_s", "t [ms]", "Time (us)", "t/s"; one that does not say its unit says nothing.
+    """
+    found = _TIME_NAME.fullmatch(name.strip())
+    return None if found is None else {**_TIMES, **_ALSO_TIMES}.get(found[1])
 
 
 def check_share(values: NDArray[np.float64], unit: str) -> None:

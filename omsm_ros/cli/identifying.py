@@ -24,6 +24,7 @@ from omsm_ros.core.dynamics.calibration import Calibration, verdict_of
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.sampled.identify_samples import HOLDS
 from omsm_ros.core.sampled.model import BAND_LIMITED, SampledModel
+from omsm_ros.core.samples.slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.identify_bag import motion_of_bag, recorded_ns_of_bag, settings_of_bag
 from omsm_ros.jobs.identify_table import (
@@ -35,12 +36,15 @@ from omsm_ros.jobs.identify_table import (
     text_of_run,
 )
 from omsm_ros.jobs.remember import remembered
+from omsm_ros.quantities import shown
 from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.files import whole_file
 from omsm_ros.storage.model_file import load_model, save_model
 
 TABLE_SUFFIX = ".csv"
+ENCODER = "encoder"
+_MAX_DELAY = 3
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
@@ -51,7 +55,7 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--input",
-        default="encoder",
+        default=ENCODER,
         help="'encoder' or 'reference' of a bag; of a table, the name of a column",
     )
     sub.add_argument("--output", help="of a table, the name of a column")
@@ -68,9 +72,8 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--max-delay",
         type=number(quantities.MAX_DELAY_SAMPLES),
-        default=3,
         metavar="SAMPLES",
-        help="of a held input, the longest delay tried",
+        help=f"of a held input, the longest delay tried; {_MAX_DELAY} if left out",
     )
     sub.add_argument(
         "--duration", type=number(quantities.DURATION), default=0.0, help="[s] to use; 0 = all"
@@ -145,15 +148,42 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
                 f"a table needs --{' and --'.join(missing)}: the name of the column that follows "
                 "the input, and the seconds from line to line"
             )
+        _check_for_bags(args)
     elif args.output is not None or args.period is not None:
         raise ConfigurationError(
             f"--output and --period are for a table; {str(args.recording)!r} is no {TABLE_SUFFIX} "
             "file, and a bag knows both: leave them out"
         )
 
+    if args.max_delay is not None and args.hold == BAND_LIMITED:
+        raise ConfigurationError(
+            "--max-delay is of a held input; give --hold zero-order or first-order, or leave it out"
+        )
+    if not of_table and args.hold != BAND_LIMITED and args.input != ENCODER:
+        raise ConfigurationError(
+            f"--hold takes the encoder of a bag as its input, not {shown(args.input)}; leave out "
+            "--input, or --hold"
+        )
+
+
+def _check_for_bags(args: argparse.Namespace) -> None:
+    """Raise ConfigurationError for what a table has not, and would be passed over."""
+    stated = {
+        "--by-stamps": args.by_stamps,
+        "--counter-offset": args.counter_offset != 0,
+        "--stamp-tolerance": args.stamp_tolerance != TWO_DRIVERS_S,
+        "--settings": bool(args.settings),
+    }
+    if passed_over := [name for name, given in stated.items() if given]:
+        raise ConfigurationError(
+            f"{' and '.join(passed_over)} is for a bag; a table has no counters, stamps or "
+            "settings: leave it out"
+        )
+
 
 def _model_facts(record: SampledRecord, args: argparse.Namespace) -> Facts:
-    model = model_of(record, hold=args.hold, order=args.order, max_delay=args.max_delay)
+    longest = _MAX_DELAY if args.max_delay is None else args.max_delay
+    model = model_of(record, hold=args.hold, order=args.order, max_delay=longest)
     path = kept_at(args.out, str(model.certificate["verdict"]))
     save_model(path, model)
     facts = {

@@ -12,7 +12,15 @@ from omsm_ros.core.sampled.identify_samples import identify_samples
 from omsm_ros.core.sampled.model import SampledModel
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
 from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.storage.table_file import load_columns
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.foreign_units import seconds_of
+from omsm_ros.readable import quantity
+from omsm_ros.storage.table_file import first_line, load_columns
+
+# Clocks of two computers differ by a tenth of this.
+_SAME_PERIOD = 5e-3
+# Periods; a time that is written with few digits scatters by one.
+_GAP = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +36,43 @@ class SampledRecord:
 def record_of_table(
     path: Path, input: str, output: str, period: float, duration: float = 0.0
 ) -> SampledRecord:
-    """Read two columns of a CSV file, one line a ``period`` [s]; ``duration`` [s], 0 = all."""
+    """Read two columns of a CSV file, one line a ``period`` [s]; ``duration`` [s], 0 = all.
+
+    Raises DataError where a column of time says otherwise.
+    """
+    _check_time(path, period)
     columns = load_columns(path, (input, output))
     lines = round(duration / period) or len(columns[0])
     u, y = (column[:lines] for column in columns)
     return SampledRecord(u, y, np.ones(len(y), np.bool_), period)
+
+
+def _check_time(path: Path, period: float) -> None:
+    """Raise DataError where a column of time, which says its unit, contradicts the ``period`` [s].
+
+    Frequencies would all be wrong by the same factor, and no residual would show it; where lines
+    are missing, what comes after them is of another instant.
+    """
+    named = {name: one for name in first_line(path) if (one := seconds_of(name)) is not None}
+    for name, second in named.items():
+        try:
+            (time,) = load_columns(path, (name,))
+        except FileError:  # dates, or the like
+            continue
+        steps = np.diff(time) * second
+        mean, most = float(np.mean(steps)), float(np.max(steps))
+        even = abs(float(np.median(steps)) / period - 1) < _SAME_PERIOD
+        if even and most > _GAP * period:
+            raise DataError(
+                f"table {str(path)!r}: {name!r} goes on by {quantity(most, 's')} after row "
+                f"{int(np.argmax(steps)) + 1}, where rows are {quantity(period, 's')} apart: cut "
+                "the record there"
+            )
+        if abs(mean / period - 1) > _SAME_PERIOD:
+            raise DataError(
+                f"table {str(path)!r}: by {name!r} a row takes {mean:.6g} s, not {period:.6g} s; "
+                "give the period of the record, or correct the name of that column"
+            )
 
 
 def record_of_motion(motion: MotionRecord) -> SampledRecord:

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import yaml
 
-from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.write_recording import write_recording
+from omsm_ros.readable import count, quantity
 from omsm_ros.storage.disturbance_file import load_disturbances
 from omsm_ros.storage.files import save_text
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
 
+# Half a gigabyte of memory, a whole with everything that may be wrong with a machine.
+_MOST_SAMPLES = 1_000_000
 STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
 
 
@@ -32,13 +36,29 @@ class TwinBags:
 def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = None) -> TwinBags:
     """Write ``steps.mcap``, ``scan.mcap`` and the nominal ``mirror.yaml`` into ``out``.
 
-    Raises BagError where a bag of that name is there already.
+    Raises BagError where a bag of that name is there already, ConfigurationError for a scan beyond
+    the mirror or longer than memory holds.
     """
+    _check(scenario)
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
     steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
     write_nominal(out / NOMINAL)
     return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+
+
+def _check(scenario: Scenario) -> None:
+    if scenario.start_radius > PAPER_MIRROR_RADIUS_M:
+        raise ConfigurationError(
+            f"a radius of {quantity(scenario.start_radius, 'm')} is beyond the twin's mirror, "
+            f"which ends at {quantity(PAPER_MIRROR_RADIUS_M, 'm')}; give it in metres"
+        )
+    samples = spiral_of(scenario).duration / scenario.sample_period
+    if samples > _MOST_SAMPLES:
+        raise ConfigurationError(
+            f"a scan of {count(round(samples))} samples, expected {count(_MOST_SAMPLES)} at most; "
+            "take a wider feed, a smaller radius or a faster spindle"
+        )
 
 
 def write_nominal(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -59,6 +60,12 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
         np.ascontiguousarray(SIGNAL.checked_all(table[:, i], FileError, f"{what}: {name}"))
         for i, name in enumerate(names)
     ]
+
+
+def first_line(path: Path | str) -> list[str]:
+    """Return the cells of the line of names of a CSV file."""
+    text = read_text(path, MAX_TABLE_BYTES, FileError, "table").removeprefix(_MARK)
+    return _cells(re.split("[\r\n]", text, maxsplit=1)[0], ",")
 
 
 def _cells(line: str, mark: str) -> list[str]:

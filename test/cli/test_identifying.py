@@ -202,3 +202,55 @@ def test_validate_writes_no_run_where_the_page_cannot_be(capsys, table, tmp_path
     assert not out.exists()
     assert cli.main(words) == 0
     assert out.read_text().startswith("time_s,input,output,model")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--by-stamps",), "--by-stamps is for a bag"),
+        (("--counter-offset", 2), "--counter-offset is for a bag"),
+        (("--settings", '{"machine": "a"}'), "--settings is for a bag"),
+        (("--max-delay", 5), "--max-delay is of a held input"),
+    ],
+)
+def test_what_would_be_passed_over_is_refused(capsys, table, tmp_path, arguments, says):
+    status, said = run(capsys, table, *COLUMNS, "--out", tmp_path / "m.json", *arguments)
+    assert status == 2
+    assert says in said.err
+
+
+def test_a_hold_takes_no_reference(capsys, step_test, tmp_path):
+    given = ("--hold", "zero-order", "--input", "reference", "--out", tmp_path / "m.json")
+    status, said = run(capsys, tmp_path / "any.mcap", *given)
+    assert status == 2
+    assert "--hold takes the encoder of a bag" in said.err
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "says"),
+    [
+        ("time_s", 0.1, None),
+        ("t [ms]", 100.0, None),
+        ("Time (ms)", 200.0, "a row takes 0.2 s, not 0.1 s"),
+        ("t/s", 1.0, "a row takes 1 s, not 0.1 s"),
+        ("t", 7.0, None),
+        ("temperature_s", 7.0, None),
+    ],
+)
+def test_a_column_of_time_holds_the_period(capsys, table, tmp_path, name, step, says):
+    rows = np.loadtxt(table, delimiter=",", skiprows=1)
+    rows = np.column_stack([step * np.arange(len(rows)), rows])
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header=f"{name},valve,flow", comments="")
+    status, said = run(capsys, tmp_path / "r.csv", *COLUMNS, "--out", tmp_path / "m.json")
+    assert says in said.err if says else status == 0
+    assert status == (2 if says else 0)
+
+
+def test_lines_that_are_missing_by_a_column_of_time_are_named(capsys, table, tmp_path):
+    rows = np.loadtxt(table, delimiter=",", skiprows=1)
+    time = 0.1 * np.arange(len(rows)) + 0.3 * (np.arange(len(rows)) >= 200)
+    rows = np.column_stack([time, rows])
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="time_s,valve,flow", comments="")
+    status, said = run(capsys, tmp_path / "r.csv", *COLUMNS, "--out", tmp_path / "m.json")
+    assert status == 2
+    assert "goes on by 400 ms after row 200" in said.err

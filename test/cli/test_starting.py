@@ -30,6 +30,16 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
     assert [check["state"] for check in told["checks"]] == ["fine", "faulty"]
 
 
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [("--radius=2", "beyond the twin's mirror"), ("--feed=1e-7", "40 000 000 samples")],
+)
+def test_a_scan_of_the_twin_that_no_memory_holds_is_refused(capsys, tmp_path, option, says):
+    assert cli.main(["twin", "--out", str(tmp_path / "shop"), option]) == 2
+    assert says in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
 def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
     command = ["twin", "--out", str(tmp_path), "--radius", "5e-4", "--rpm", "60", "--json"]
     assert cli.main(command) == 0
