@@ -211,9 +211,11 @@ def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:
 def _of_square(square: float, spread: float) -> Figure:
     """Return the root of a ``square`` [m²] known to ``spread``, k = 1.
 
-    Its uncertainty is half of the larger side of the interval that k = 2 of the square is.
+    Its uncertainty is half of the larger side of the interval that k = 2 of the square is. Errors
+    that are not as they were drawn may take more from the square than there is: then that ends no
+    nearer to zero than the square is known, for no figure is known to be zero.
     """
     value = float(np.sqrt(max(square, 0.0)))
-    high = float(np.sqrt(max(square + 2 * spread, 0.0)))
+    high = float(np.sqrt(max(square + 2 * spread, spread)))
     low = float(np.sqrt(max(square - 2 * spread, 0.0)))
     return Figure(value, max(high - value, value - low) / 2)

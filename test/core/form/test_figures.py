@@ -188,3 +188,12 @@ def test_noise_is_told_from_ripple_in_any_order_of_points():
     assert noise_of(value) > 5e-8
     assert 0.9e-9 < noise_beside(x, y, value) < 6e-9
     assert noise_beside(x, 0 * y, value) == pytest.approx(1e-9, rel=0.1)
+
+
+def test_a_figure_from_which_errors_take_more_than_there_is_is_not_known_to_be_zero():
+    """Every other point is half a micrometre off: what noise of that size would be takes all."""
+    errors = 0.5e-6 * (-1.0) ** np.arange(len(FORM))
+    found = figures(map_of(FORM + errors, noise=0.5e-6))
+    for name in ("pv", "robust"):
+        assert found[name].value < 0.1 * np.ptp(FORM)
+        assert abs(np.ptp(FORM) - found[name].value) < 3 * found[name].uncertainty
