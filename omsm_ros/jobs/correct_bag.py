@@ -103,7 +103,7 @@ def correct_bag(
         overridden = "; ".join(["OVERRIDDEN", *scan.reasons]) if scan.reasons else ""
         comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
         with PlyWriter(cloud, comment) as ply:
-            found = _Findings(nominal, by_counter=by_stamps is None)
+            found = _Findings(nominal, lateral, by_counter=by_stamps is None)
             for block, points in scan.steps():
                 found.see(block)
                 if points is not None:
@@ -118,8 +118,8 @@ def correct_bag(
 class _Findings:
     """What is learnt of the points while they pass."""
 
-    def __init__(self, nominal: Surface | None, by_counter: bool) -> None:
-        self._nominal, self._by_counter = nominal, by_counter
+    def __init__(self, nominal: Surface | None, lateral: float, by_counter: bool) -> None:
+        self._nominal, self._lateral, self._by_counter = nominal, lateral, by_counter
         self._axes, self._distance = StreamWatch(), StreamWatch()
         self._z = (np.inf, -np.inf)
         names = ("error",) if nominal is None else ("error", "raw", "corrected")
@@ -146,6 +146,9 @@ class _Findings:
             lapse = scan.time_lapse
             found += [*self._axes.period_fault("axes", lapse)]
             found += [*self._distance.period_fault("distance", lapse)]
+            stated = scan.options.sources
+            resolution = stated.encoder_resolution if stated else 0.0
+            found += self._axes.step_faults(resolution, self._lateral)
             found += skew_fault(skew, scan.sample_period, scan.trigger)
             samples = scan.account.distance.counted.get("slipped", 0)
             found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)

@@ -36,6 +36,10 @@ _LEAST_HELD, _LONGER = 100, 50.0
 # Readings at an end of all, and as many times those next to it; of coarse ones, which repeat this
 # often on the average, many may lie there.
 _LEAST_PILED, _PILED, _COARSE = 20, 10.0, 5.0
+# Samples of the axes in which steps are looked for, and how many steps tell.
+_STEPS_LOOKED_FOR, _STEPS_TOLD = 1_000_000, 20
+# Half a probe's noise, and what a slope of a per cent makes it: less is in no figure.
+_STEP_OF_HEIGHT_M, _STEP_SIDEWAYS_M = 5e-9, 1e-6
 
 
 class StreamWatch:
@@ -54,6 +58,8 @@ class StreamWatch:
         self.gaps: list[tuple[int, int]] = []
         self.periods: set[float] = set()
         self._readings = _Readings()
+        self._steps = {axis: _Steps() for axis in "xzc"}
+        self._widest = 0.0
         self._count = TriggerCount()
         # Of each session: counts of first samples and their stamps [ns].
         self._marks: list[list[IntArray]] = []
@@ -83,6 +89,11 @@ class StreamWatch:
         elif isinstance(block, AxisBlock):
             axes = np.array([block.x, block.y, block.z, block.b, block.c])
             self.invalid += int(np.sum(~np.all(np.isfinite(axes), axis=0)))
+            if self.samples <= _STEPS_LOOKED_FOR:
+                x = np.abs(block.x[np.isfinite(block.x)])
+                self._widest = float(np.max(x, initial=self._widest))
+                for axis, steps in self._steps.items():
+                    steps.add(getattr(block, axis))
 
     def marks(self, since_ns: int) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield counts, and stamps after ``since_ns`` [s], of the blocks of each session."""
@@ -107,6 +118,28 @@ class StreamWatch:
         said = contradiction(name, count, stamp, min(self.periods), time_lapse)
         if said is not None:
             yield said
+
+    def step_faults(self, resolution: float = 0.0, lateral: float = 0.0) -> Iterator[str]:
+        """Yield which axes stand still and jump by so much that heights are open by it.
+
+        resolution: step of Z that is stated [m];  lateral: uncertainty of places that is [m]
+        A control that passes on positions slower than the trigger comes, or in coarse counts.
+        """
+        x, z, c = (self._steps[axis].size for axis in "xzc")
+        left = z / np.sqrt(12)
+        if left > _STEP_OF_HEIGHT_M and z > 1.5 * resolution:
+            yield (
+                f"Z stands still and goes on in steps of {quantity(z, 'm')}, which leaves every "
+                f"height open by {quantity(left, 'm')} (rms): record it at each trigger and with "
+                "all its digits, or state encoder_resolution"
+            )
+        for axis, unit, size, sideways in (("X", "m", x, x), ("C", "rad", c, c * self._widest)):
+            if (left := sideways / np.sqrt(12)) > max(_STEP_SIDEWAYS_M, 1.5 * lateral):
+                yield (
+                    f"{axis} stands still and goes on in steps of {quantity(size, unit)}, which "
+                    f"leaves places open by {quantity(left, 'm')} (rms): record it at each trigger "
+                    "and with all its digits, or state --lateral"
+                )
 
     def faults(self, name: str) -> Iterator[str]:
         """Yield what is wrong, in words for people; nothing is with what never came."""
@@ -182,6 +215,34 @@ class _Readings:
                     "of its range, or that number stands for no reading; centre the probe, or mark "
                     "such readings as invalid"
                 )
+
+
+class _Steps:
+    """Follows an axis: whether it stands still between its steps, and how large these are."""
+
+    def __init__(self) -> None:
+        self._tail = np.empty(0)
+        self._moves = self._alone = 0
+        self._squares = 0.0
+
+    def add(self, positions: FloatArray) -> None:
+        """Take the next positions (n,); those that are none break the row."""
+        row = np.concatenate([self._tail, positions])
+        self._tail = row[-3:]
+        steps = np.diff(row)
+        moved = steps != 0
+        inner = steps[1:-1]
+        self._moves += int(np.count_nonzero(moved[1:-1]))
+        alone = inner[moved[1:-1] & ~moved[:-2] & ~moved[2:]]
+        self._alone += len(alone)
+        self._squares += float(np.sum(alone**2))
+
+    @property
+    def size(self) -> float:
+        """Of a step, rms; 0 where most steps follow on another one."""
+        if self._alone < max(_STEPS_TOLD, self._moves / 2):
+            return 0.0
+        return float(np.sqrt(self._squares / self._alone))
 
 
 class _End:

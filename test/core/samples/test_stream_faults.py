@@ -182,3 +182,41 @@ def test_places_where_an_axis_was_lost_are_counted_once_each() -> None:
     z, c = block.z.copy(), block.c.copy()
     z[[3, 7]], c[[7, 50]] = np.nan, np.nan
     assert watched(replace(block, z=z, c=c), axes(100)).invalid == 3
+
+
+TIME = np.arange(6000) * PERIOD
+
+
+def moving(size: int = 100, **axis: np.ndarray) -> StreamWatch:
+    """A spiral with Z to and fro, one of its axes as given."""
+    whole = {"x": 5e-3 - 5e-5 * TIME, "z": 1e-5 * np.sin(2 * TIME), "c": np.pi * TIME, **axis}
+    blocks = []
+    for first in range(0, len(TIME), size):
+        part = {name: values[first : first + size] for name, values in whole.items()}
+        blocks.append(replace(axes(first, len(part["x"])), **part))
+    return watched(*blocks)
+
+
+@pytest.mark.parametrize("size", [1, 100, 6000])
+def test_an_axis_that_stands_still_between_steps_is_named(size: int) -> None:
+    held = np.arange(6000) // 10 * 10
+    assert list(moving(size).step_faults()) == []
+    (said,) = moving(size, z=np.round(1e-5 * np.sin(2 * TIME), 7)).step_faults()
+    assert "Z stands still and goes on in steps of 100 nm" in said
+    assert "open by 28.9 nm" in said
+    (said,) = moving(size, c=np.pi * TIME[held]).step_faults()
+    assert "C stands still and goes on in steps of 31.4 mrad" in said
+    assert f"open by {5e3 * 10 * np.pi * PERIOD / np.sqrt(12):.1f} µm" in said
+    (said,) = moving(size, x=5e-3 - 5e-5 * TIME[held // 200 * 200]).step_faults()
+    assert "X stands still and goes on in steps of 10.0 µm" in said
+
+
+def test_steps_that_are_stated_or_harmless_are_no_fault() -> None:
+    coarse = moving(z=np.round(1e-5 * np.sin(2 * TIME), 7))
+    assert list(coarse.step_faults(resolution=1e-7)) == []
+    held = np.pi * TIME[np.arange(6000) // 10 * 10]
+    assert list(moving(c=held).step_faults(lateral=50e-6)) == []
+    fine = np.round(1e-5 * np.sin(2 * TIME), 8)
+    rests = np.where(TIME < 4.0, 0.0, 1e-5 * np.sin(2 * TIME))
+    for z in (fine, rests, np.where(np.arange(6000) % 7 == 3, np.nan, rests)):
+        assert list(moving(z=z).step_faults()) == []
