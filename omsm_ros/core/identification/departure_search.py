@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from omsm_ros.core.departures.as_poles import as_fitted, poles_of, with_poles
 from omsm_ros.core.departures.families import (
     BACKLASH,
     CREEP,
@@ -25,14 +26,13 @@ from omsm_ros.core.departures.families import (
 )
 from omsm_ros.core.departures.survey import Judged, Survey
 from omsm_ros.core.departures.term import Term
-from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.encoder_noise import without_unfollowed
-from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.order_choice import MAX_POLES, Candidate, information
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.order_choice import Candidate, information
 from omsm_ros.core.fitting.order_choice import choose as choose_candidate
 from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.identification.model_choice import Model, no_worse
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
@@ -107,11 +107,11 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
         if again:
             prepared, beside = _renewed(prepared, survey, beside, again)
             settled |= again
-            prepared, model = choose(prepared)
+            prepared, model = _again(prepared, model, choose)
         elif columns:
             prepared, added = _with_columns(prepared, columns, beside)
             beside += added
-            prepared, model = choose(prepared)
+            prepared, model = _again(prepared, model, choose)
             grown, without = [], []
         else:
             larger = _grown(prepared, model, shown[0].term)
@@ -120,7 +120,7 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
                 refused.add(shown[0].term.family)
                 continue
             prepared, model = larger
-            grown.append(_as_fitted(shown[0].term, model.chosen.fit))
+            grown.append(as_fitted(shown[0].term, model.chosen.fit))
             without.append(survey)
         survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
     return Searched(prepared, model, survey, beside, grown, survey.significant(settled), without)
@@ -134,8 +134,14 @@ def _first(prepared: Prepared, choose: Choose) -> tuple[Prepared, list[ModelledT
     if columns:
         prepared, added = _with_columns(prepared, columns, beside)
         beside += added
-        prepared, model = choose(prepared)
+        prepared, model = _again(prepared, model, choose)
     return prepared, beside, model
+
+
+def _again(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
+    """Return a problem that has changed since ``model`` was chosen, and the model chosen anew."""
+    prepared, found = choose(prepared)
+    return prepared, no_worse(prepared.problem, found, model.chosen.fit)
 
 
 def _quieter(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
@@ -260,15 +266,19 @@ def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Mode
     """Return the model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
         return None
-    problem, new = prepared.problem, _poles(term)
+    problem, new = prepared.problem, poles_of(term)
     decays = float(np.min(-new.real)) * len(problem.input) * problem.period
     if term.family == CREEP or decays < _FORGOTTEN_DECAYS:
         # What has not died away at the end has not when a period begins anew.
         problem = replace(problem, fits_initial_condition=True)
     starts = _FASTER if term.family == CREEP else _BESIDE_MODE
-    tried = [_with_poles(problem, base, new, starts) for base in _bases(model)]
+    tried = [with_poles(problem, base, new, starts) for base in _bases(model)]
     # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
-    found = [c for c in tried if c is not None and _decays(c.fit, problem)]
+    found = [
+        Candidate(fitted, information(fitted))
+        for fitted in tried
+        if fitted is not None and _decays(fitted, problem)
+    ]
     best = min(found, key=lambda candidate: candidate.bic, default=None)
     chosen = model.chosen.fit
     if problem is not prepared.problem:
@@ -278,15 +288,6 @@ def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Mode
         return None
     grown = replace(model, chosen=best, candidates=[*model.candidates, best])
     return replace(prepared, problem=problem), grown
-
-
-def _as_fitted(term: Term, fitted: Fit) -> Term:
-    """Return ``term`` with the time constant [s] or frequency [Hz] of the pole that it became."""
-    poles = fitted.dynamics.poles()
-    near = np.abs(np.log(poles / _poles(term)[0]))
-    pole = poles[int(np.argmin(near))]
-    parameter = 1 / abs(pole) if term.family == CREEP else abs(pole) / (2 * np.pi)
-    return replace(term, parameter=float(parameter), damping=float(-pole.real / abs(pole)))
 
 
 def _bases(model: Model) -> list[Fit]:
@@ -308,40 +309,6 @@ def _best_plain(model: Model) -> Fit | None:
 
 def _plain(model: Model) -> list[Candidate]:
     return [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
-
-
-def _with_poles(
-    problem: Problem, base: Fit, new: ComplexArray, starts: Sequence[float]
-) -> Candidate | None:
-    """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them."""
-    zeros, delay = base.structure.zeros + len(new), base.structure.delay
-    larger = Structure(base.structure.poles + len(new), zeros, delay)
-    if larger.poles > MAX_POLES:
-        return None
-    scaled = Scaled(larger, problem.rate)
-    late = float(base.nonlinear[-1]) if delay else 0.0
-    own = base.dynamics.poles()
-    found = fit(
-        problem,
-        larger,
-        [
-            scaled.nonlinear_of(_scaled([own, faster * new], problem.rate), late)
-            for faster in starts
-        ],
-    )
-    return Candidate(found, information(found))
-
-
-def _scaled(poles: Sequence[ComplexArray], rate: float) -> ComplexArray:
-    return np.asarray(np.concatenate(poles) / rate, np.complex128)
-
-
-def _poles(term: Term) -> ComplexArray:
-    if term.family == CREEP:
-        return np.array([-1 / term.parameter], np.complex128)
-    omega = 2 * np.pi * term.parameter
-    upper = omega * (-term.damping + 1j * np.sqrt(1 - term.damping**2))
-    return np.array([upper, np.conj(upper)], np.complex128)
 
 
 def _decays(found: Fit, problem: Problem) -> bool:

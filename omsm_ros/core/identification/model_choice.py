@@ -62,6 +62,21 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     return _model(problem, explore(fit_structure, order, colour, problem.effort), order)
 
 
+def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
+    """Return ``found``, or with the structure of ``before`` where that describes more.
+
+    before: fitted to the problem as it was. When so much was tried that no further order is begun,
+        its structure may not be among those of ``found``.
+    """
+    if not problem.effort.spent:
+        return found
+    again = fit(problem, before.structure, [before.nonlinear])
+    candidate = Candidate(again, information(again))
+    if candidate.bic >= information(found.chosen.fit):
+        return found
+    return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
+
+
 def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Model:
     candidates = _identifiable(problem, explored)
     free = Model(choose(candidates), candidates)

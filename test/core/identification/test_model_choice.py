@@ -1,0 +1,66 @@
+"""What is left of a choice when a record was compared with models often enough."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.fitting.descent import Effort
+from omsm_ros.core.fitting.model_structure import Structure
+from omsm_ros.core.fitting.order_choice import Candidate, information
+from omsm_ros.core.fitting.output_error import fit
+from omsm_ros.core.fitting.preparation import prepare
+from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.identification.model_choice import Model, no_worse
+
+from .recorded_motions import record_of, recorded
+
+SPENT = Effort(comparisons=10**6)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A problem, its fit by a delay alone, and by a structure with its roll-off."""
+    problem = prepare(record_of(recorded()), "encoder").problem
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    two = Structure(2, 1, False)
+    return problem, lag, fit(problem, two, StartingPoints(problem, lag).of(two, [lag]))
+
+
+def chosen(found):
+    candidate = Candidate(found, information(found))
+    return Model(candidate, [candidate])
+
+
+def test_where_not_all_was_tried_the_structure_before_stays(fitted):
+    problem, lag, two = fitted
+    kept = no_worse(replace(problem, effort=SPENT), chosen(lag), two)
+    assert kept.chosen.fit.structure == two.structure
+    assert kept.chosen.fit.sum_of_squares <= two.sum_of_squares * (1 + 1e-9)
+    assert kept.candidates[-1] is kept.chosen
+
+
+def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
+    problem, lag, two = fitted
+    line = 30e-9 * np.sin(2 * np.pi * 40.0 * problem.period * np.arange(len(problem.used)))
+    changed = replace(
+        problem,
+        output=problem.output + line,
+        background=np.column_stack([problem.background, line]),
+        effort=SPENT,
+    )
+    kept = no_worse(changed, chosen(lag), two).chosen.fit
+    assert kept.background[-1] == pytest.approx(1.0, abs=0.05)
+    assert kept.rms == pytest.approx(two.rms, rel=0.01)
+
+
+def test_what_describes_more_is_not_given_up(fitted):
+    problem, lag, two = fitted
+    found = chosen(two)
+    assert no_worse(replace(problem, effort=SPENT), found, lag) is found
+
+
+def test_where_all_was_tried_the_choice_stands(fitted):
+    problem, lag, two = fitted
+    found = chosen(lag)
+    assert no_worse(replace(problem, effort=Effort()), found, two) is found
