@@ -13,11 +13,16 @@ from omsm_ros.cli.arguments import number
 from omsm_ros.cli.catalogue_option import ADDRESS, declare_catalogue
 from omsm_ros.cli.command import Command, Facts, progress_bar
 from omsm_ros.cli.printing import say, table, written
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.jobs.run_campaign import DONE, Entry, load_summary, run_campaign
+from omsm_ros.quantities import shown
 from omsm_ros.storage.calibration_file import load_calibration
 from omsm_ros.storage.files import REPORT, save_text
 
 _INDEX = "index.html"
+
+# What a campaign gives each bag itself, and how short nothing stands for an option yet.
+_DECIDED, _LEAST_SHORT = ("--out", "--calibration"), 3
 
 
 def _declare_batch(sub: argparse.ArgumentParser) -> None:
@@ -48,10 +53,25 @@ def _batch(args: argparse.Namespace) -> Facts:
 
 
 def _options(args: argparse.Namespace) -> list[str]:
-    """Return the options of every correction; what the environment says, it reads for itself."""
+    """Return the options of every correction; what the environment says, it reads for itself.
+
+    Raises ConfigurationError for what a campaign decides: all results would lie in one folder, or
+    be of another calibration than their page says.
+    """
+    for word in args.passed_on:
+        if taken := next((o for o in _DECIDED if _stands_for(word, o)), None):
+            raise ConfigurationError(
+                f"{taken} stands after '--' as {shown(word)}; give it before, once for all bags"
+            )
     if args.catalogue == os.environ.get(ADDRESS, ""):
         return list(args.passed_on)
     return [*args.passed_on, "--catalogue", args.catalogue]
+
+
+def _stands_for(word: str, option: str) -> bool:
+    """Return whether a ``word`` of the command line is ``option``, or short for it."""
+    name, _, _ = word.partition("=")
+    return len(name) > _LEAST_SHORT and option.startswith(name)
 
 
 def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path) -> None:

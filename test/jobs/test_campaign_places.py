@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from omsm_ros.cli import main
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.jobs import run_campaign as campaign
 from omsm_ros.jobs.run_campaign import DONE, Entry, bags_below, load_campaign, run_campaign
@@ -179,3 +180,13 @@ def test_a_scheduler_that_runs_whatever_it_is_sent_is_on_this_host(shop, tmp_pat
     with pytest.raises(ConfigurationError, match=told) as refused:
         run_campaign(folder, tmp_path / "cal.json", tmp_path / "out", scheduler=scheduler)
     assert scheduler in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "words", [("--out", "x"), ("--calibration=b.json",), ("--calib", "b.json")]
+)
+def test_what_a_campaign_decides_is_no_option_of_its_bags(shop, corrected, tmp_path, capsys, words):
+    given = ["batch", str(shop("a.mcap")), "--calibration", str(tmp_path / "cal.json")]
+    assert main([*given, "--out", str(tmp_path / "out"), "--", *words]) == 2
+    assert "stands after '--' as" in capsys.readouterr().err
+    assert not corrected
