@@ -28,6 +28,8 @@ _WORST_CONDITION = 1e6
 _GROUP, _LEAST_GROUPS = 128, 4
 # Of sums over passes: a wave of sixteen passes leaves a four-hundredth, noise all of itself.
 _DIFFERENCES = 4
+# Of the variance of single points: sums over groups that cancel to less scatter by rounding alone.
+_ROUNDING = 1e-12
 # Terms of the series 1 / (1 − h) in the share h that a group has of the fit, some tenth.
 _FOLLOWED = 2
 
@@ -237,6 +239,9 @@ def _no_less(covariance: FloatArray, floor: FloatArray) -> FloatArray:
 
     Few groups lie at the rim: by chance they may state far too little.
     """
-    ratio = np.diag(floor) / np.maximum(np.diag(covariance), np.finfo(np.float64).tiny)
-    more = np.sqrt(np.maximum(ratio, 1.0))
-    return np.asarray(covariance * np.outer(more, more), np.float64)
+    own, least = np.diag(covariance), np.diag(floor)
+    scatters = own > _ROUNDING * least
+    ratio = np.where(scatters, np.maximum(least / np.where(scatters, own, 1.0), 1.0), 0.0)
+    more = np.sqrt(ratio)
+    raised = covariance * np.outer(more, more) + np.diag(np.where(scatters, 0.0, least))
+    return np.asarray(raised, np.float64)

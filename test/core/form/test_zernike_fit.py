@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.surface.zernike_terms import first_terms, zernike_values
+from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values
 from omsm_ros.errors import DataError
 
 DISC, TERMS = Aperture(12.7e-3, 1e-4, -2e-4), first_terms(37)
@@ -141,3 +141,16 @@ def test_coefficients_of_effects_are_those_of_the_same_fit():
 def test_too_few_points_are_refused():
     with pytest.raises(DataError, match="50 points for 37 Zernike terms, expected 74"):
         fit_zernikes(*np.random.default_rng(0).uniform(-1e-3, 1e-3, (3, 50)), TERMS, DISC)
+
+
+def test_sums_that_cancel_to_rounding_leave_the_scatter_of_points():
+    """A wave across a strip, the same in each of its lines: tip of the lines has no scatter."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 19) * 3e-6, np.linspace(-1, 1, 19) * 3e-3)
+    x, y = x.ravel(), y.ravel()
+    deviation = 1e-6 * np.sin(2 * np.pi * x / 3.7e-6)
+    terms = (Term(0, 0), Term(1, -1), Term(1, 1))
+    with np.errstate(all="raise"):
+        found = fit_zernikes(x, y, deviation, terms, Aperture(3e-3, 0.0, 0.0))
+        assert np.all(np.isfinite(found.uncertainty))
+    assert np.all(np.linalg.eigvalsh(found.covariance) >= -1e-30)
+    assert np.all(found.uncertainty > 1e-9)
