@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
+from scipy import ndimage, signal
 
 from omsm_ros.core.fitting.output_error import Problem
 from omsm_ros.core.fitting.reading_steps import plateau_variance, plateaus, reading_step
 from omsm_ros.core.fitting.steps import (
     LEAST_SAMPLES,
+    NOISE_FACTOR,
+    TRAVEL_PART,
     Steps,
     check_usable,
     find_steps,
@@ -45,11 +47,16 @@ _PLAUSIBLE_GAIN = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A problem, the steps in its motion, and the number of single readings taken out."""
+    """A problem, and the steps in its motion.
+
+    spikes: number of single readings of the probe that were taken out
+    axis_spikes: of those of the axis that were replaced by what lies around them
+    """
 
     problem: Problem
     steps: Steps
     spikes: int
+    axis_spikes: int = 0
 
 
 def prepare(record: MotionRecord, source: str) -> Prepared:
@@ -59,7 +66,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     follow it, ConfigurationError for another source.
     """
     check_usable(record)
-    motion = _motion(record, source)
+    motion, axis_spikes = _bridged(_motion(record, source))
     steps = _recorded_whole(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)
     if steps.edges:
@@ -67,7 +74,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
         check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
-    return Prepared(_with_reading_steps(problem, steps), steps, spikes)
+    return Prepared(_with_reading_steps(problem, steps), steps, spikes, axis_spikes)
 
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
@@ -91,6 +98,28 @@ def _motion(record: MotionRecord, source: str) -> FloatArray:
         )
     index = np.arange(len(known))
     return np.asarray(np.interp(index, index[known], record.reference[known]))
+
+
+def _bridged(motion: FloatArray) -> tuple[FloatArray, int]:
+    """Return ``motion`` (n,) without single positions that stand apart from both sides; how many.
+
+    They are replaced by the cubic through two neighbours on each side. An axis does not go where
+    no neighbour is: a bit or a line of the encoder was read wrongly, and the probe saw none of it.
+    """
+    calm = ndimage.median_filter(motion, 3, mode="nearest")
+    least = max(NOISE_FACTOR * sample_noise(calm), TRAVEL_PART * float(np.ptp(calm)))
+    if float(np.ptp(calm)) <= max(least, 1e-12):
+        return motion, 0  # all that moves are spikes
+    step = np.diff(motion)
+    outer, inner = motion[:-4] + motion[4:], motion[1:-3] + motion[3:-1]
+    across = 0.5 * (motion[3:-1] - motion[1:-3])
+    expected = (9 * inner - outer) / 16
+    # What the speed does nearby is no spike, however sharp an edge.
+    around = np.maximum(np.abs(across - step[:-3]), np.abs(across - step[3:]))
+    spikes = np.flatnonzero(np.abs(motion[2:-2] - expected) > least + 2 * around)
+    bridged = motion.copy()
+    bridged[spikes + 2] = expected[spikes]
+    return bridged, len(spikes)
 
 
 def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:

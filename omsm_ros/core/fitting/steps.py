@@ -24,8 +24,8 @@ _MOST_SAMPLES = 800_000
 # Far beyond the range of any probe that could have seen the motion.
 _GREATEST_TRAVEL_M = 20e-3
 # Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
-_NOISE_FACTOR = 20.0
-_TRAVEL_PART = 2e-3
+NOISE_FACTOR = 20.0
+TRAVEL_PART = 2e-3
 _DIFFERENCES = (2, 4, 6, 8)
 # Rest is the axis staying put for this long, and an edge ends when it begins.
 _REST_S = 20e-3
@@ -83,12 +83,12 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
             f"Z travels {quantity(travel, 'm')}, a probe follows a fixed target over "
             f"{quantity(_GREATEST_TRAVEL_M, 'm')} at most; positions must be in metres"
         )
-    if travel <= max(_NOISE_FACTOR * noise, 1e-12):
+    if travel <= max(NOISE_FACTOR * noise, 1e-12):
         raise StepTestError(
             f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: no steps; "
             "run the step test while recording"
         )
-    moving = _moving(z, sample_period, max(_NOISE_FACTOR * noise, _TRAVEL_PART * travel))
+    moving = _moving(z, sample_period, max(NOISE_FACTOR * noise, TRAVEL_PART * travel))
     return Steps(_edges(z, moving), moving, noise, travel)
 
 

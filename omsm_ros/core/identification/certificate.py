@@ -87,6 +87,7 @@ def _structure(candidate: Candidate) -> dict[str, object]:
 def _residual_entries(evidence: Evidence) -> dict[str, object]:
     prepared, tests = evidence.prepared, evidence.residual
     compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
+    compared |= {"axis_spikes": prepared.axis_spikes} if prepared.axis_spikes else {}
     return {
         "noise_covariance": evidence.known.from_noise.ravel().tolist(),
         "residual_rms_m": evidence.fit.rms,

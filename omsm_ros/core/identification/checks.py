@@ -101,6 +101,19 @@ def encoder_noise(unfollowed: FloatArray | None, noise: float) -> Finding:
     )
 
 
+def dropouts(spikes: int) -> Finding:
+    """Tell of single positions of the axis that its encoder read wrongly."""
+    if not spikes:
+        return Finding()
+    return Finding(
+        warnings=(
+            f"single positions of the axis ({spikes}) stood apart from those around them and were "
+            "replaced; a scan keeps such points: check the cable of the encoder, and its scale for "
+            "dirt",
+        ),
+    )
+
+
 def two_clocks(by_stamps: bool) -> Finding:
     """Reserve a record whose streams were joined by the stamps of two clocks."""
     if not by_stamps:
@@ -259,6 +272,7 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: scale(abs(e.fit.gain)),
     lambda e: timing(e.residual.timing, e.residual.axis_timing),
     lambda e: encoder_noise(e.prepared.problem.unfollowed, e.residual.noise),
+    lambda e: dropouts(e.prepared.axis_spikes),
     lambda e: two_clocks(e.record.by_stamps),
     lambda e: departures(e.searched),
     lambda e: independence(

@@ -33,6 +33,33 @@ def test_edges_are_no_spikes():
     assert prepare(record_of(), "encoder").spikes == 0
 
 
+@pytest.mark.parametrize("off", [1e-6, -40e-6, 5e-3])
+def test_single_positions_that_stand_apart_are_bridged(off):
+    """At rest, within an edge and next to one; where the axis was is known to nanometres."""
+    record = record_of()
+    edge = prepare(record, "encoder").steps.edges[3]
+    places = [700, (edge.start + edge.stop) // 2, edge.start - 3, 9000]
+    wrong = record.z.copy()
+    wrong[places] += off
+    found = prepare(MotionRecord.from_arrays(1e-3, wrong, record.distance), "encoder")
+    assert found.axis_spikes == len(places)
+    whole = prepare(record, "encoder")
+    assert whole.axis_spikes == 0
+    assert [(e.start, e.stop) for e in found.steps.edges] == [
+        (e.start, e.stop) for e in whole.steps.edges
+    ]
+    np.testing.assert_allclose(found.problem.input, whole.problem.input, rtol=0, atol=3e-8)
+
+
+def test_a_motion_of_nothing_but_pulses_is_left_as_it_is():
+    z = np.zeros(5000)
+    z[500::500] = 1e-5
+    with pytest.raises(IdentificationError, match=r"per travel of the axis|does not change"):
+        prepare(
+            MotionRecord.from_arrays(1e-3, z, -1e-3 * z + 1e-9 * np.sin(TIME[:5000])), "encoder"
+        )
+
+
 def test_lost_samples_are_not_used():
     prepared = prepare(record_of(lost=slice(2000, 2100)), "encoder")
     assert not np.any(prepared.problem.used[2000:2100])

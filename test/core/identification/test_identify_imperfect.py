@@ -174,3 +174,18 @@ class TestRefusals:
     def test_an_absent_reference(self):
         z, distance = self.arrays()
         self.refuse(DataError, "no reading of a reference", z, distance, input="reference")
+
+
+def test_a_wrong_bit_of_the_encoder_costs_nothing():
+    """A position read wrongly by 3 µm, in a rest and in an edge."""
+    recording = recorded()
+    z = recording.axes.z.copy()
+    z[[2600, 5011]] += 3e-6
+    found = identify(record_of(recording, z=z)).calibration
+    right = identify(record_of(recording)).calibration
+    assert str(found.certificate["verdict"]).startswith("accepted,")
+    assert found.certificate["samples"]["axis_spikes"] == 2
+    assert any("stood apart" in warning for warning in found.certificate["warnings"])
+    frequency = np.array([1.0, 15.0])
+    ratio = found.dynamics.response(frequency) / right.dynamics.response(frequency)
+    np.testing.assert_allclose(np.abs(ratio - 1), 0, atol=2e-5)
