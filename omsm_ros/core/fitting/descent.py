@@ -23,18 +23,34 @@ _CONVERGED = 1e-4
 # Of 270 disturbed step tests those that were accepted had at most 1200 before their last round,
 # and half of them fewer than 250 in all; 1500 of 20 s at 1 kHz take five to eight seconds.
 _ENOUGH = 1500
+# Samples compared: as many comparisons of 20 s at 1 kHz, and some with all of a long record, of
+# which most are compared in fewer samples.
+_ENOUGH_SAMPLES, _ENOUGH_OF_ALL = 30_000_000, 300
 
 
 @dataclass(eq=False)
 class Effort:
-    """How often a record was compared with a model, in all the problems that were made of it."""
+    """How often a record was compared with a model, in all the problems that were made of it.
+
+    comparisons: with all of its samples, or half of them
+    samples: compared in all, of those with fewer too;  longest: most of them at a time
+    """
 
     comparisons: int = 0
+    samples: int = 0
+    longest: int = 0
+
+    def count(self, samples: int) -> None:
+        """Count a comparison of so many ``samples``."""
+        self.longest = max(self.longest, samples)
+        self.samples += samples
+        self.comparisons += 2 * samples > self.longest
 
     @property
     def spent(self) -> bool:
         """Whether no further order and no further departure is to be begun."""
-        return self.comparisons > _ENOUGH
+        most = _ENOUGH_SAMPLES + _ENOUGH_OF_ALL * self.longest
+        return self.comparisons > _ENOUGH or self.samples > most
 
 
 @dataclass(frozen=True, eq=False)

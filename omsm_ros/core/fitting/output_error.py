@@ -144,7 +144,7 @@ class Problem:
 
     def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
-        self.effort.comparisons += 1
+        self.effort.count(len(self._places))
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
         moved = self._moved(structure, lag)
         # Column after column in memory, as LAPACK has it: numpy's takes five times as long.

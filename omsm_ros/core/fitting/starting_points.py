@@ -16,7 +16,6 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.dynamics.transfer_function import ComplexArray, ascending_roots
-from omsm_ros.core.fitting.descent import Effort
 from omsm_ros.core.fitting.model_structure import Scaled, Structure
 from omsm_ros.core.fitting.output_error import Fit, Problem, fit
 from omsm_ros.core.samples.blocks import BoolArray, FloatArray
@@ -75,8 +74,7 @@ class StartingPoints:
         every = int(min(problem.closed_length / ENOUGH_SAMPLES, per_content))
         if every <= 1:
             return None
-        # Of what a record may cost, comparisons with all of it are counted.
-        return replace(self, problem=replace(coarser(problem, every), effort=Effort()))
+        return replace(self, problem=coarser(problem, every))
 
     @cached_property
     def _probe(self) -> ComplexArray:

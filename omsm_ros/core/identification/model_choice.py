@@ -49,17 +49,22 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     """
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    points = StartingPoints(problem, lag)
+    points, before = StartingPoints(problem, lag), None
     if points.coarser is not None:
         model = _chosen_on_fewer(prepared, points.coarser, lag, order)
-        if follows_beyond(problem, model.chosen.fit, points.coarser.problem) > _NOTHING_BEYOND:
+        before = model.chosen.fit
+        if (
+            problem.effort.spent
+            or follows_beyond(problem, before, points.coarser.problem) > _NOTHING_BEYOND
+        ):
             return model
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller))
 
     colour = noise_colour(problem, lag, prepared.steps)
-    return _model(problem, explore(fit_structure, order, colour, problem.effort), order)
+    found = _model(problem, explore(fit_structure, order, colour, problem.effort), order)
+    return found if before is None else no_worse(problem, found, before)
 
 
 def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
@@ -72,7 +77,8 @@ def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
         return found
     again = fit(problem, before.structure, [before.nonlinear])
     candidate = Candidate(again, information(again))
-    if candidate.bic >= information(found.chosen.fit):
+    better = candidate.bic < information(found.chosen.fit)
+    if not better or not _identifiable(problem, [candidate]):
         return found
     return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
 
