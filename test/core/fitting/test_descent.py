@@ -240,3 +240,34 @@ def test_effort_is_spent_at_some_time() -> None:
     assert not effort.spent
     effort.comparisons += 100_000
     assert effort.spent
+
+
+def compared(samples: int, times: int, effort: Effort) -> Effort:
+    for _ in range(times):
+        effort.count(samples)
+    return effort
+
+
+def test_a_record_of_ten_seconds_is_compared_1500_times() -> None:
+    effort = compared(10_000, 1500, Effort())
+    assert not effort.spent
+    assert compared(10_000, 1, effort).spent
+
+
+def test_comparisons_with_fewer_samples_cost_what_they_take() -> None:
+    """Those of a long record: hundreds with all of it, thousands with a tenth."""
+    effort = compared(200_000, 200, Effort())
+    assert not compared(20_000, 2000, effort).spent
+    assert effort.comparisons == 200
+    assert compared(20_000, 1000, effort).spent
+
+
+def test_ever_longer_records_are_compared_less_often() -> None:
+    most = []
+    for samples in (20_000, 40_000, 400_000):
+        effort = Effort()
+        while not effort.spent:
+            effort.count(samples)
+        most.append(effort.comparisons)
+    assert most == sorted(most, reverse=True)
+    assert most[-1] > 300
