@@ -42,8 +42,9 @@ DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
 _FREE = 1e6
 # Where the noise is looked for; the residuals tell it after one step.
 _NOISE_M = 10e-9
-# Of the prior's variance; rounding leaves less.
-_DETERMINED = 1e-6
+# Of the prior's standard deviation. Two scans of one speed, or of opposite ones, hardly tell lag
+# from surface: they move it by a few ns, more than they should and less than anybody could see.
+_HARMLESS = 0.03
 # Keep what is exactly known from dividing by zero: picometres and picoradians; ns, as². Far below
 # any effect.
 _LEAST_STATED = 1e-12
@@ -312,7 +313,7 @@ def _held(covariance: FloatArray, index: int) -> FloatArray:
 def _surprise(
     values: FloatArray, prior: FloatArray, inverse: FloatArray, covariance: FloatArray
 ) -> float:
-    """Return χ² of lag and curvature against what was known before.
+    """Return χ² of lag and curvature against what was known before, harmless moves set aside.
 
     values: (2,);  prior: (2, 2);  inverse, covariance: of the normal matrix with the prior in it,
         and by rings, (2, 2)
@@ -324,6 +325,5 @@ def _surprise(
     expected = (known - 2 * inverse + covariance) / (unit * unit[:, np.newaxis])
     spread, directions = np.linalg.eigh(expected)
     moved = directions.T @ (values / unit)
-    # Where the scans tell next to nothing, nothing moves.
-    known = spread > _DETERMINED
-    return float(np.sum(moved[known] ** 2 / spread[known]))
+    # Scans that tell next to nothing move nothing, or by less than a step test would notice.
+    return float(np.sum(moved**2 / (np.maximum(spread, 0.0) + _HARMLESS**2)))

@@ -238,3 +238,19 @@ def test_an_inverse_is_that_of_the_textbook() -> None:
     found = _inverse(np.array([[2.0, 1.0], [1.0, 3.0]]) * np.outer(units, units))
     expected = np.array([[0.6, -0.2], [-0.2, 0.4]]) / np.outer(units, units)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_same_there_and_back_contradicts_no_step_test() -> None:
+    """Both directions at one speed tell hardly any lag; that it moves at all is no contradiction."""
+    found = [
+        fitted([scanned(rpm, seed=2 * seed + k) for k, rpm in enumerate((30.0, -30.0))])
+        for seed in range(5)
+    ]
+    assert max(abs(f.values[LAG]) for f in found) < 1e-6
+    assert max(f.surprise for f in found) < 6.0
+
+
+def test_a_lag_far_beyond_the_step_test_contradicts_it() -> None:
+    prior = replace(PRIOR, covariance=np.diag([1e-6, 1e-7, 0.0, 1e-2]) ** 2)
+    assert fitted(pair(latency=LATENCY_S), prior).surprise < 14.0
+    assert fitted(pair(latency=LATENCY_S, lag=100e-6), prior).surprise > 100.0
