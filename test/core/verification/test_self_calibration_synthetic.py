@@ -241,7 +241,7 @@ def test_an_inverse_is_that_of_the_textbook() -> None:
 
 
 def test_the_same_there_and_back_contradicts_no_step_test() -> None:
-    """Both directions at one speed tell hardly any lag; that it moves at all is no contradiction."""
+    """Both directions at one speed tell hardly any lag; that it moves is no contradiction."""
     found = [
         fitted([scanned(rpm, seed=2 * seed + k) for k, rpm in enumerate((30.0, -30.0))])
         for seed in range(5)
