@@ -38,14 +38,16 @@ def load_fields(path: Path | str) -> ScanFields:
     if len(raw) > MAX_BYTES:
         raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
     try:
-        with np.load(io.BytesIO(raw)) as content:  # no pickles, by default
+        # No pickles, by default; a NaN that signals is refused below.
+        with np.load(io.BytesIO(raw)) as content, np.errstate(invalid="ignore"):
             names, fields, every = (np.asarray(content[name]) for name in _NAMES)
             # Where nobody says which are upper bounds, each may be one.
             bounds = content["bounds"] if "bounds" in content else np.unique(names)
             aligned = content.get("aligned", ())
+            values = fields.astype(np.float64)
         found = ScanFields(
             tuple(map(str, names)),
-            fields.astype(np.float64),
+            values,
             int(every),
             tuple(map(str, bounds)),
             tuple(map(str, aligned)),

@@ -70,3 +70,12 @@ def test_what_is_no_archive_is_refused(tmp_path, raw):
     path.write_bytes(raw)
     with pytest.raises(FileError, match="damaged"):
         load_fields(path)
+
+
+def test_a_damaged_number_is_refused_without_a_warning(tmp_path):
+    """A signalling NaN, as turned bits leave it."""
+    path = tmp_path / "systematic.npz"
+    wrong = np.full((1, 4), 0x7F800001, np.uint32).view(np.float32)
+    np.savez(path, names=np.array(["tilt"]), fields=wrong, every=1)
+    with pytest.raises(FileError, match="hold what is no number; correct the scan again"):
+        load_fields(path)
