@@ -221,11 +221,15 @@ def test_a_slip_of_the_counters_is_an_error_and_ends_the_points(cell, true_calib
             DistanceBlock(**common, stamp_ns=stamp + missed * 1_000_000, distance=zero),
         )
     cell.wait(
-        "all samples in the account",
-        lambda: cell.operator.value("corrector", "distance_received") == 40 * length,
+        "all samples of both in the account",
+        lambda: all(
+            cell.operator.value("corrector", f"{stream}_received") == 40 * length
+            for stream in ("axes", "distance")
+        ),
     )
     cell.wait("the slip", lambda: cell.operator.value("corrector", "slip_samples") == -2)
-    assert cell.operator.value("corrector", "distance_slipped") >= 1000
+    for stream in ("axes", "distance"):
+        assert cell.operator.value("corrector", f"{stream}_slipped") == 20 * length
     cell.processes.check()
 
 
