@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy import fft, signal
 
-from omsm_ros.core.departures.hysteresis import dahl, lost_in_gap, without_noise
+from omsm_ros.core.departures.hysteresis import dahl, lost_in_gaps, without_noise
 from omsm_ros.core.departures.term import Family, Term
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.output_error import Fit, Problem
@@ -69,6 +69,7 @@ class Departures:
 
     def families(self, only: Collection[str] = ()) -> Iterator[Family]:
         """Return the families that this motion could show at all, or those named of them."""
+        turning = cache(self._turning)  # as long as families are asked for: it is large
         makers: dict[str, Callable[[], Iterator[Family]]] = {
             CREEP: lambda: iter([self.creep()]),
             MODE: lambda: iter([self.modes()]),
@@ -77,8 +78,8 @@ class Departures:
             LINEARITY: lambda: iter([self.linearity()]),
             STIFFENING: lambda: iter([self.stiffening()]),
             PERIODIC: lambda: iter([self.periodic()]),
-            FRICTION: self.friction,
-            BACKLASH: self.backlash,
+            FRICTION: lambda: self.friction(turning),
+            BACKLASH: lambda: self.backlash(turning),
         }
         for name, make in makers.items():
             if not only or name in only:
@@ -246,12 +247,12 @@ class Departures:
 
         return Family(PERIODIC, np.asarray(periods), trials, part, 2)
 
-    def friction(self) -> Iterator[Family]:
+    def friction(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
         """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
         if not self.steps.edges:
             return
 
-        moved = self._turning()[::_FINER].copy()
+        moved = turning()[::_FINER].copy()
 
         def part(first: int, last: int) -> FloatArray:
             columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl(moved, t)]
@@ -268,12 +269,11 @@ class Departures:
         answer = _FINER * fft.irfft(self._answer / self.fitted.gain, length)
         return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
 
-    def backlash(self) -> Iterator[Family]:
+    def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
         """Return half of the backlash: by the last reversal, and by the last step."""
 
         def part(first: int, last: int) -> FloatArray:
-            gaps, moved = _GAPS_M[first:last], self._turning()
-            lost = [c[::_FINER] for gap in gaps for c in lost_in_gap(moved, gap)]
+            lost = [c[::_FINER] for c in lost_in_gaps(turning(), _GAPS_M[first:last])]
             return -self.fitted.gain * np.column_stack(lost)
 
         if self.steps.edges:

@@ -6,6 +6,8 @@ few times its noise; so noise at rest changes nothing.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
 from omsm_ros.core.samples.blocks import FloatArray
@@ -41,14 +43,15 @@ def through_gap(motion: FloatArray, half: float) -> FloatArray:
     return np.asarray(np.minimum(held, near, out=held))
 
 
-def lost_in_gap(motion: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the lead of ``motion`` (n,) over half the ``gap`` [m], -1 to 1, and a start column.
+def lost_in_gaps(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
+    """Yield the lead of ``motion`` (n,) over half of each gap [m], -1 to 1, and its start column.
 
     Until the whole gap is crossed, what is ahead depends on where in it the motion began.
     """
-    ahead = (motion - through_gap(motion, 0.5 * gap)) / (0.5 * gap)
     crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
-    return np.asarray(ahead), np.asarray(np.clip(1.0 - crossed / gap, 0.0, 1.0))
+    for gap in gaps:
+        yield (motion - through_gap(motion, 0.5 * gap)) / (0.5 * gap)
+        yield np.clip(1.0 - crossed / gap, 0.0, 1.0)
 
 
 def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ from omsm_ros.core.fitting.order_choice import Candidate, information
 from omsm_ros.core.fitting.order_choice import choose as choose_candidate
 from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.identification.model_choice import Model, no_worse
+from omsm_ros.core.identification.model_choice import Model, chosen_alike, no_worse
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
@@ -149,7 +149,10 @@ def _quieter(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared
     problem = without_unfollowed(prepared.problem, model.chosen.fit)
     if problem is None:
         return prepared, model
-    quieter, found = choose(replace(prepared, problem=problem))
+    quieter = replace(prepared, problem=problem)
+    found = chosen_alike(problem, model)
+    if found is None:
+        quieter, found = choose(quieter)
     better = information(found.chosen.fit) < information(model.chosen.fit)
     return (quieter, found) if better else (prepared, model)
 

@@ -24,6 +24,8 @@ from omsm_ros.core.identification.residual_tests import follows_beyond, noise_co
 # Of what is worse by so much on fewer samples none is chosen on all of them; a structure is chosen
 # within one parameter of the best, at 14 at most.
 _MAY_BE_CHOSEN_BIC = 30.0
+# "Not worth more than a bare mention" (Kass and Raftery 1995).
+_ALIKE_BIC = 2.0
 # Beyond the first ones, of a fit that starts at the minimum over fewer samples.
 _NEARLY_EVALUATIONS = 2
 # Probability by chance below which what moves faster than fewer samples show tells more.
@@ -81,6 +83,29 @@ def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
     if not better or not _identifiable(problem, [candidate]):
         return found
     return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
+
+
+def chosen_alike(problem: Problem, before: Model) -> Model | None:
+    """Return ``before``, which was chosen while the problem was another, fitted to it as it is.
+
+    None where the change lets some candidates describe more than others: then a structure that
+    was not tried may describe more too.
+    """
+    best = min(c.bic for c in before.candidates)
+    changes, candidates = [], []
+    for known in before.candidates:
+        now = evaluated(problem, known.fit.structure, known.fit.nonlinear)
+        change = information(now) - information(known.fit)
+        if known.bic < best + _MAY_BE_CHOSEN_BIC:
+            changes.append(change)
+        candidates.append(Candidate(now, known.bic + change))
+    if before.free is not None or max(changes) - min(changes) > _ALIKE_BIC:
+        return None
+    fitted, nonlinear = before.chosen.fit, before.chosen.fit.nonlinear
+    again = fit(problem, fitted.structure, [nonlinear])
+    chosen = Candidate(again, before.chosen.bic + information(again) - information(fitted))
+    others = [c for c in candidates if c.fit.structure != fitted.structure]
+    return replace(before, chosen=chosen, candidates=[*others, chosen])
 
 
 def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Model:

@@ -212,12 +212,11 @@ class TestWhichFamilies:
 
     def test_steps_all_up_show_a_gap_of_the_motion_and_none_of_the_steps(self, clean):
         rising = replace(clean.steps, edges=clean.steps.edges[:3])
-        names = [
-            f.parameters[0] for f in Departures(clean.problem, clean.fitted, rising).backlash()
-        ]
+        departures = Departures(clean.problem, clean.fitted, rising)
+        names = [family.parameters[0] for family in departures.families((BACKLASH,))]
         assert len(names) == 1
         assert names[0] > 0
-        assert len(list(clean.departures.backlash())) == 2
+        assert len(list(clean.departures.families((BACKLASH,)))) == 2
 
     def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, departures):
         for family in departures.families((FRICTION, BACKLASH)):
@@ -225,7 +224,7 @@ class TestWhichFamilies:
 
     def test_what_a_gap_loses_is_what_the_probe_does_not_follow(self, departures, step_test_of):
         """Half a gap of 300 nm, against the play operator on the true motion."""
-        (of_travel, _) = departures.backlash()
+        (of_travel, _) = departures.families((BACKLASH,))
         half, state, lost = 150e-9, step_test_of.late[0], []
         for value in step_test_of.late:
             state = min(max(state, value - half), value + half)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.departures.hysteresis import dahl, lost_in_gap, through_gap, without_noise
+from omsm_ros.core.departures.hysteresis import dahl, lost_in_gaps, through_gap, without_noise
 
 few = settings(max_examples=40)
 # Sixteenths are exact, so that shifted and turned motions are.
@@ -73,7 +73,7 @@ class TestGap:
         """Up it leads by half the gap once that is taken up; back it gives way over all of it."""
         up = np.arange(0, 33) / 16.0
         motion = np.r_[up, up[-2::-1]]
-        ahead, start = lost_in_gap(motion, 1.0)
+        ahead, start = lost_in_gaps(motion, [1.0])
         np.testing.assert_allclose(ahead[:33], np.minimum(up / 0.5, 1.0))
         np.testing.assert_allclose(ahead[33:], np.maximum(1.0 - (2.0 - motion[33:]) / 0.5, -1.0))
         np.testing.assert_allclose(start[:33], np.maximum(1.0 - up, 0.0))
@@ -82,7 +82,7 @@ class TestGap:
     @few
     @given(motions, halves)
     def test_the_lead_is_within_the_gap_and_what_it_began_with_only_fades(self, motion, half):
-        ahead, start = lost_in_gap(motion, half)
+        ahead, start = lost_in_gaps(motion, [half])
         assert np.all(abs(ahead) <= 1)
         assert start[0] == 1
         assert np.all(np.diff(start) <= 0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.departures.hysteresis import lost_in_gap, through_gap, without_noise
+from omsm_ros.core.departures.hysteresis import lost_in_gaps, through_gap, without_noise
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.machine.trajectories import StepTest
 from omsm_ros.core.samples.motion_record import MotionRecord
@@ -32,7 +32,7 @@ def test_a_gap_is_the_play_operator(half):
 
 def test_what_is_lost_lies_within_the_gap_and_its_start_is_forgotten_when_crossed():
     motion = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, -1, 100)])
-    ahead, start = lost_in_gap(motion, 0.5)
+    ahead, start = lost_in_gaps(motion, [0.5])
     assert (np.min(ahead), np.max(ahead)) == (pytest.approx(-1), pytest.approx(1))
     assert start[0] == 1.0
     assert np.all(start[motion.cumsum() > 15] == 0)

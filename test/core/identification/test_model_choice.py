@@ -1,4 +1,4 @@
-"""What is left of a choice when a record was compared with models often enough."""
+"""What is left of a choice where the problem has changed, or was compared often enough."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from omsm_ros.core.fitting.order_choice import Candidate, information
 from omsm_ros.core.fitting.output_error import fit
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.fitting.starting_points import StartingPoints
-from omsm_ros.core.identification.model_choice import Model, no_worse
+from omsm_ros.core.identification.model_choice import Model, chosen_alike, no_worse
 
 from .recorded_motions import record_of, recorded
 
@@ -64,3 +64,40 @@ def test_where_all_was_tried_the_choice_stands(fitted):
     problem, lag, two = fitted
     found = chosen(lag)
     assert no_worse(replace(problem, effort=Effort()), found, two) is found
+
+
+def among(lag, two):
+    """The choice of ``two`` among both."""
+    candidates = [Candidate(each, information(each)) for each in (lag, two)]
+    return Model(candidates[1], candidates)
+
+
+def test_what_all_candidates_lack_alike_leaves_the_choice(fitted):
+    """Nobody's column: each describes as much more of what is left when it is taken out."""
+    problem, _, two = fitted
+    three = fit(problem, Structure(2, 1, True), [np.append(two.nonlinear, 0.01)])
+    line = 3e-9 * np.sin(2 * np.pi * 40.0 * problem.period * np.arange(len(problem.used)))
+    quieter = replace(problem, output=problem.output - line)
+    kept = chosen_alike(quieter, among(three, two))
+    again = fit(quieter, two.structure, [two.nonlinear])
+    assert kept.chosen.fit.sum_of_squares == pytest.approx(again.sum_of_squares, rel=1e-9, abs=0)
+    assert kept.chosen in kept.candidates
+    for candidate in kept.candidates:
+        assert candidate.bic == pytest.approx(information(candidate.fit), rel=1e-9)
+        assert len(candidate.fit.residual) == len(two.residual)
+
+
+def test_what_one_candidate_gains_more_by_asks_for_another_choice(fitted):
+    """The output of a pole more: the delay alone describes it as badly as before."""
+    problem, lag, two = fitted
+    exact = replace(
+        problem, output=problem.modelled(two) + 0.1 * (problem.output - problem.modelled(two))
+    )
+    assert chosen_alike(exact, among(two, lag)) is None
+    assert chosen_alike(problem, among(two, lag)) is not None
+
+
+def test_of_an_order_that_was_asked_for_the_free_choice_is_made_anew(fitted):
+    problem, lag, two = fitted
+    asked = replace(among(lag, two), free=among(lag, two))
+    assert chosen_alike(problem, asked) is None
