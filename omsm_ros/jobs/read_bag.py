@@ -49,5 +49,5 @@ def path_in(path: AnyBag, progress: Progress = no_progress) -> ScanPath:
         name = bag.name_of(bags.AXES_TOPIC)
     found = start.path()
     if found is None:
-        raise BagError(f"{str(path)!r} has no samples on {name!r}; record a motion")
+        raise BagError(f"{str(path)!r} has no position of Z on {name!r}; record a motion")
     return found

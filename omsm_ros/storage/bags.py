@@ -47,6 +47,7 @@ from omsm_ros.storage.recording.topics import (
     VIBRATION_TOPIC,
     AnyBag,
     CellBag,
+    relative,
 )
 from omsm_ros.storage.vibration_levels import vibration_levels
 
@@ -61,6 +62,9 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     VIBRATION_TOPIC: vibration_levels,
     TEMPERATURE_TOPIC: conversions.temperature,
 }
+
+# Messages of other types are also those of other programs, who put into them what they like.
+_OURS = "omsm_msgs/"
 
 _BLOCKS: dict[str, type] = {
     AXES_TOPIC: AxisBlock,
@@ -94,6 +98,15 @@ class TopicSummary:
     type: str
     messages: int
     role: str = ""
+
+
+def check_message(topic: str, kind: str, raw: bytes) -> None:
+    """Raise an exception for a message of a cell that no reader would take."""
+    for role, expected in TOPIC_TYPES.items():
+        ours = kind.startswith(_OURS) or relative(topic) == relative(role)
+        if kind == expected and ours:
+            _TO_RECORD[role](typestore().deserialize_cdr(raw, kind))
+            return
 
 
 class BagReader:
@@ -261,7 +274,10 @@ class BagReader:
         try:
             yield
         except (DataError, CalibrationError) as err:
-            raise BagError(f"bag {str(self.path)!r} holds a malformed message: {err}") from err
+            raise BagError(
+                f"bag {str(self.path)!r} holds a malformed message: {err}; leave it out with "
+                "'omsm inspect --repair'"
+            ) from err
 
     def _raw(
         self,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -42,8 +42,8 @@ class ScanPath:
 class PathStart:
     """The first samples of a path, gathered from the blocks of a stream while they pass.
 
-    Across a gap in the counter, or to another sample period, no motion is known: the path is the
-    longest run without either.
+    Across a gap in the counter, or where Z was lost, or to another sample period, no motion is
+    known: the path is the longest run without any of them.
     """
 
     def __init__(self, most: int) -> None:
@@ -58,7 +58,8 @@ class PathStart:
         if isinstance(block, AxisBlock):
             self._passed += len(block)
             if self._kept < self._most:
-                self._keep(block)
+                for part in _known(block):
+                    self._keep(part)
         elif isinstance(block, DistanceBlock) and self._readings_kept < self._most:
             readings = np.where(block.ok, block.distance, np.nan)
             self._readings.append((block.first_sample, readings))
@@ -71,13 +72,15 @@ class PathStart:
         self._kept += len(block)
 
     def path(self) -> ScanPath | None:
-        """Return the path gathered so far; None if there were no axes."""
+        """Return the path gathered so far; None if Z was never known."""
         if not self._runs:
             return None
         run = max(self._runs, key=lambda run: sum(map(len, run)))
         z, x, c = (np.concatenate([getattr(b, name) for b in run])[: self._most] for name in "zxc")
         first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
-        within = [readings for at, readings in self._readings if first <= at < end]
+        within = [
+            readings[max(first - at, 0) : max(end - at, 0)] for at, readings in self._readings
+        ]
         distance = np.concatenate(within)[: self._most] if within else None
         return ScanPath(
             z=z,
@@ -106,6 +109,18 @@ class PathStart:
 def _named(breaks: Sequence[str]) -> str:
     rest = len(breaks) - _MOST_NAMED
     return ", ".join(breaks[:_MOST_NAMED]) + (f" and {rest} more gaps" if rest > 0 else "")
+
+
+def _known(block: AxisBlock) -> Iterator[AxisBlock]:
+    """Yield the runs of a block in which Z is known."""
+    known = np.isfinite(block.z)
+    if np.all(known):
+        yield block
+        return
+    edges = np.flatnonzero(np.diff(known, prepend=False, append=False))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        channels = {name: getattr(block, name)[begin:end] for name in "xyzbc"}
+        yield replace(block, first_sample=block.first_sample + begin, **channels)
 
 
 def _break(last: AxisBlock, block: AxisBlock) -> str:

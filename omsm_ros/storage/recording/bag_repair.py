@@ -1,6 +1,7 @@
 """What can be saved of a recording that was cut short or damaged?
 
-Every whole chunk whose checksum fits, copied message by message into a new bag with an index.
+Every whole chunk whose checksum fits, copied message by message into a new bag with an index,
+without the messages that no command could read.
 """
 
 from __future__ import annotations
@@ -21,14 +22,26 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from omsm_ros.errors import BagError
-from omsm_ros.storage.bag_checks import MAX_CHUNK_BYTES, check_unpacked, unpacked_chunk
+from omsm_ros.storage.bag_checks import (
+    MAX_CHUNK_BYTES,
+    check_unpacked,
+    unpacked_chunk,
+    unpacked_message,
+)
+from omsm_ros.storage.bags import check_message
 from omsm_ros.storage.files import open_regular, said
+from omsm_ros.storage.message_types import typestore
 from omsm_ros.storage.recording.bag_writer import finish, new_bag_file, new_writer
+from omsm_ros.storage.recording.topics import TOPIC_TYPES
 
 _HEAD_BYTES = 9
 # Besides its samples a chunk record has two times, sizes, a checksum and a name.
 _MOST_BYTES = MAX_CHUNK_BYTES + 1000
 _MOST_NAMED = 20
+# Of a message that rosbag2 compressed by itself; a serialised message begins with a zero.
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+# What rosbag2 keeps of a channel's type beside its definition.
+_TYPE_HASH = "topic_type_hash"
 
 
 @dataclass
@@ -105,8 +118,8 @@ class _Copy:
 
     def __init__(self, path: Path, writer: Writer, made: Repair) -> None:
         self._path, self._writer, self._made = path, writer, made
-        self._schemas: dict[int, int] = {0: 0}
-        self._channels: dict[int, tuple[int, str]] = {}
+        self._schemas: dict[int, tuple[int, str]] = {0: (0, "")}
+        self._channels: dict[int, tuple[int, str, str]] = {}
         self._unpacked = 0
 
     def run(self, written: Callable[[], None]) -> None:
@@ -160,31 +173,45 @@ class _Copy:
 
     def _add(self, record: McapRecord) -> None:
         if isinstance(record, Schema) and record.id not in self._schemas:
-            self._schemas[record.id] = self._writer.register_schema(
-                record.name, record.encoding, record.data
-            )
+            number = self._writer.register_schema(record.name, record.encoding, record.data)
+            self._schemas[record.id] = number, record.name
         elif isinstance(record, Channel) and record.id not in self._channels:
+            schema, kind = self._schemas[record.schema_id]
+            if record.metadata.get(_TYPE_HASH) not in (None, _hash_of(kind)):
+                kind = ""  # of another definition: nobody here can tell what is whole
             number = self._writer.register_channel(
-                record.topic,
-                record.message_encoding,
-                self._schemas[record.schema_id],
-                record.metadata,
+                record.topic, record.message_encoding, schema, record.metadata
             )
-            self._channels[record.id] = number, record.topic
+            self._channels[record.id] = number, record.topic, kind
         elif isinstance(record, Message):
             if record.channel_id not in self._channels:
                 raise ValueError(f"channel {record.channel_id} was declared in a part that is lost")
-            number, topic = self._channels[record.channel_id]
-            self._writer.add_message(
-                number, record.log_time, record.data, record.publish_time, record.sequence
-            )
-            self._made.messages[topic] += 1
+            self._add_message(record, *self._channels[record.channel_id])
+
+    def _add_message(self, record: Message, number: int, topic: str, kind: str) -> None:
+        try:
+            data = record.data
+            if data.startswith(_ZSTD_MAGIC):  # only metadata.yaml would say so, which is not copied
+                data = unpacked_message(data)
+            check_message(topic, kind, data)
+        except Exception as err:  # the libraries raise what their parts raise
+            self._lose(f"a message of {topic!r} at {record.log_time} ns: {said(err)}")
+            return
+        self._writer.add_message(
+            number, record.log_time, data, record.publish_time, record.sequence
+        )
+        self._made.messages[topic] += 1
 
     def _lose(self, what: str) -> None:
         if len(self._made.lost) < _MOST_NAMED:
             self._made.lost.append(f"{self._path.name}: {what}")
         else:
             self._made.unnamed += 1
+
+
+def _hash_of(kind: str) -> str | None:
+    """Return the hash of a type as we know it; None if we do not."""
+    return typestore().hash_rihs01(kind) if kind in TOPIC_TYPES.values() else None
 
 
 def _check_records(data: bytes) -> None:

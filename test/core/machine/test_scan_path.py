@@ -50,6 +50,22 @@ def test_the_longest_run_is_taken_where_there_is_a_gap() -> None:
     )
 
 
+def test_the_longest_run_is_taken_where_z_was_lost() -> None:
+    """As where the encoder failed, or the probe began before axes that are joined by stamps."""
+    z = Z[100:900].copy()
+    z[[0, 1, 200]] = np.nan
+    found = path_of(
+        axes(0, 100), distance(0, 100), replace(axes(100, 900), z=z), distance(100, 900)
+    )
+    np.testing.assert_array_equal(found.z, Z[301:900])
+    np.testing.assert_array_equal(found.distance, -Z[301:900])
+    assert found.left_out == (
+        "judged are only 599 of 900 samples, triggers 301 to 899, the longest run without a gap: "
+        "2 are missing (100 to 101), 1 are missing (300 to 300)"
+    )
+    assert path_of(replace(axes(0, 100), z=np.full(100, np.nan))) is None
+
+
 def test_each_kind_of_break_is_named_and_of_many_three() -> None:
     found = path_of(axes(0, 300), replace(axes(300, 350), sample_period=2e-3), axes(0, 100))
     assert "from 300 on the sample period is 0.002 s, after 349 the counter goes on from 0" in (

@@ -1,10 +1,13 @@
 """What can be saved of a bag that was cut short or damaged."""
 
 import struct
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import (
     CompressionFormat,
     CompressionMode,
@@ -20,6 +23,7 @@ from omsm_ros.storage.recording.bag_writer import BagWriter
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 BLOCKS, CHUNK = 24, 4
+FIRST_SAMPLE = 1_000_003
 MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -83,6 +87,76 @@ def test_a_damaged_chunk_is_left_out_and_named(whole, small_scan_blocks):
     assert "scan.mcap" in lost
     expected = [axes.first_sample for axes, _ in small_scan_blocks[:BLOCKS]]
     assert first_samples(made.path) == expected[: 2 * CHUNK] + expected[3 * CHUNK :]
+
+
+def rewritten(path, to, change, **metadata):
+    """Write the messages of a bag to another, their bytes ``change``d by (topic, place)."""
+    with path.open("rb") as stream, to.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros2")
+        channels = {}
+        for place, (schema, channel, message) in enumerate(make_reader(stream).iter_messages()):
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, "cdr", number, channel.metadata | metadata
+                )
+            data = change(channel.topic, place, message.data)
+            writer.add_message(channels[channel.topic], message.log_time, data, message.log_time)
+        writer.finish()
+
+
+def cut(topic, place, data):
+    return data[:-9]
+
+
+def counter_beyond_all(topic, place, data):
+    return data.replace(struct.pack("<Q", FIRST_SAMPLE), struct.pack("<Q", 2**63), 1)
+
+
+@pytest.mark.parametrize("spoil", [cut, counter_beyond_all])
+def test_a_message_that_no_command_reads_is_left_out_and_named(tmp_path, small_scan_blocks, spoil):
+    """The checksum of its chunk fits, for it was recorded so: a driver that went wrong once."""
+    path, spoilt = tmp_path / "scan.mcap", tmp_path / "spoilt.mcap"
+    blocks = [
+        tuple(replace(b, first_sample=FIRST_SAMPLE + b.first_sample) for b in pair)
+        for pair in small_scan_blocks[:5]
+    ]
+    with BagWriter(path, TOPICS) as bag:
+        for axes, distance in blocks:
+            bag.write_axes(axes)
+            bag.write_distance(distance)
+    rewritten(path, spoilt, lambda *m: spoil(*m) if m[1] == 0 else m[2])
+    with pytest.raises(BagError, match="omsm inspect --repair"):
+        first_samples(spoilt)
+    made = repair(spoilt)
+    (lost,) = made.lost
+    assert "a message of '/omsm/axes' at " in lost
+    assert made.messages == {bags.AXES_TOPIC: 4, bags.DISTANCE_TOPIC: 5}
+    assert first_samples(made.path) == [axes.first_sample for axes, _ in blocks[1:]]
+
+
+def test_messages_of_another_definition_are_saved_as_they_are(whole, tmp_path):
+    other = tmp_path / "other.mcap"
+    rewritten(whole, other, cut, topic_type_hash="RIHS01_of_another_release")
+    made = repair(other)
+    assert (made.messages, made.lost) == (dict.fromkeys(TOPICS, BLOCKS), [])
+
+
+def test_messages_that_were_compressed_one_by_one_can_be_read(tmp_path, small_scan_blocks):
+    """That they are is said by metadata.yaml alone, and the copy is one file."""
+    store, folder = message_types.typestore(), tmp_path / "night"
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    kind = bags.TOPIC_TYPES[bags.AXES_TOPIC]
+    with writer:
+        connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)
+        for axes, _ in small_scan_blocks[:5]:
+            message = conversions.axis_message(message_types.bag_messages(), axes)
+            writer.write(connection, axes.stamp_ns, store.serialize_cdr(message, kind))
+    made = repair(folder)
+    assert made.lost == []
+    assert first_samples(made.path) == [axes.first_sample for axes, _ in small_scan_blocks[:5]]
 
 
 def test_the_original_and_an_earlier_repair_are_never_overwritten(whole):
