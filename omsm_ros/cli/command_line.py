@@ -24,6 +24,7 @@ from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
     DEBUG,
     ConfigurationError,
+    FileError,
     OmsmError,
     defect,
     one_line,
@@ -33,7 +34,7 @@ from omsm_ros.quantities import shown
 from omsm_ros.storage import strict_json
 
 if TYPE_CHECKING:  # it would load what reads bags, for a list of words
-    from omsm_ros.cli.command import Command
+    from omsm_ros.cli.command import Command, Facts
 
 DONE, BAD_INPUT, DEFECT = 0, 2, 70  # 70 is EX_SOFTWARE of sysexits.h
 
@@ -233,14 +234,28 @@ def _run(args: argparse.Namespace) -> int:
         return _demo(args)
     with at_work(f"omsm {args.command}", args.json):
         facts = args.run.act(args)
-    if args.json:
-        print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
-    else:
-        args.run.show(facts)
+    _tell(args, facts)
     if refusal := args.run.refusal(facts):
         _complain(refusal)
         return BAD_INPUT
     return DONE
+
+
+def _tell(args: argparse.Namespace, facts: Facts) -> None:
+    try:
+        if args.json:
+            print(strict_json.text_of(strict_json.unknown_as_null(facts)))
+        else:
+            args.run.show(facts)
+        sys.stdout.flush()
+    except OSError as err:
+        if isinstance(err, BrokenPipeError) or err.filename is not None:
+            raise
+        os.dup2(_nowhere(), sys.stdout.fileno())  # what waits to be printed fails again at exit
+        raise FileError(
+            f"standard output takes no more: {err.strerror}; the command was carried out; make "
+            "room there, or send it elsewhere"
+        ) from err
 
 
 def _complain(text: str) -> None:

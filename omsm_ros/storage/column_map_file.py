@@ -84,6 +84,11 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
         raise DataError(f"{channel} needs a column's name, or a constant; give one of them")
     sign = float(given.get("sign", 1))
     if "constant" in given:
+        if channel in ("trigger", "time"):
+            raise DataError(
+                f"{channel} is constant, which tells no sample from another; name its column, or "
+                "leave it out"
+            )
         constant = SIGNAL.checked(float(given["constant"]), DataError, f"{channel}: constant")
         return Column("", constant=constant and constant * _factor(channel, given, sign))
     return Column(given["name"], _factor(channel, given, sign), unit=given.get("unit", ""))

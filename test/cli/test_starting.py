@@ -78,3 +78,16 @@ def test_the_exit_status_is_right_where_nobody_can_be_told(redirected, tmp_path)
     command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
     done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
+
+
+@pytest.mark.parametrize("options", ["", "--json"])
+def test_a_standard_output_that_is_full_is_named(options, tmp_path):
+    """As on a disk without room that the answer goes to."""
+    command = f"{sys.executable} -m omsm_ros.cli plan steps --out p {options} >/dev/full"
+    done = subprocess.run(
+        command, shell=True, cwd=tmp_path, capture_output=True, check=False, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("omsm: standard output takes no more: No space left on device;")
+    assert done.stderr.count("\n") == 1
+    assert (tmp_path / "p" / "steps.csv").exists()

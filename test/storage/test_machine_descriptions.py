@@ -174,6 +174,8 @@ def test_how_a_text_is_written_is_taken_over(file):
         (mapping(z="{name: Z, unit: rad}"), "z has the unit 'rad'; write one of"),
         (mapping(z="{name: Z, unit: count, count: 0}"), "z: one count is 0 in SI, expected"),
         (mapping(z="{unit: m}"), "z needs a column's name, or a constant; give one of them"),
+        (mapping(trigger="{constant: 0}"), "trigger is constant, which tells no sample from"),
+        (mapping(time="{constant: 0, unit: s}"), "time is constant, which tells no sample from"),
         (mapping(z="{name: Z, unit: m, sign: 2}"), r"columns.z.sign is 2, expected one of \[1, -1"),
         (mapping(z="{name: Z, unit: m, scale: 2}"), "'scale' is unknown, expected one of"),
         (mapping("zone: CET\n", z="{name: Z, unit: m}"), "zone is 'CET'"),

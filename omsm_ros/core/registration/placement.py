@@ -19,9 +19,12 @@ from omsm_ros.core.samples.even_selection import EvenSelection
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.core.surface.slopes import gradient_of, unit_normal
 from omsm_ros.errors import DataError, SurfaceError
+from omsm_ros.readable import quantity
 
 # Four for each column of the fit beside form are the least.
 LEAST_POINTS = 200
+# Below a nanometre there are atoms, and no form.
+_LEAST_EXTENT_M = 1e-9
 FREEDOMS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
 
@@ -169,7 +172,7 @@ def selection(portions: Portions, most: int) -> Portion:
 def usable(points: Placed, aperture: Aperture | None) -> Placed:
     """Return the points with a deviation that lie within the aperture.
 
-    Raises DataError for too few of them.
+    Raises DataError for too few of them, or for points closer together than any part is large.
     """
     good = np.isfinite(points.deviation)
     if aperture is not None:
@@ -178,6 +181,12 @@ def usable(points: Placed, aperture: Aperture | None) -> Placed:
         raise DataError(
             f"{count} points lie on the nominal surface, expected {LEAST_POINTS} or more; "
             "check its parameters, the aperture and the units of the cloud"
+        )
+    extent = max(float(np.ptp(v[good])) for v in (points.x, points.y))
+    if extent < _LEAST_EXTENT_M:
+        raise DataError(
+            f"the points lie within {quantity(extent, 'm')} of each other; measure across the "
+            "part, or check the units of the cloud"
         )
     return points.part(good)
 

@@ -79,7 +79,8 @@ def measured(
     sample: NDArray[Any] | None = None,
 ) -> MeasuredPoints:
     """Return the points (n,) [m] with a place and a height; those that have none are counted."""
-    x, y, height = (np.ascontiguousarray(v, np.float64) for v in (x, y, height))
+    with np.errstate(invalid="ignore"):  # a signalling NaN of single precision is a NaN too
+        x, y, height = (np.ascontiguousarray(v, np.float64) for v in (x, y, height))
     known = np.isfinite(height) & ~np.isnan(x) & ~np.isnan(y)
     order = None if sample is None else COUNTER.checked_all(sample[known], DataError, "sample")
     return MeasuredPoints(

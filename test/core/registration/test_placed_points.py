@@ -159,6 +159,16 @@ def test_as_many_points_as_the_fit_needs_are_enough(count):
         usable(at, None)
 
 
+@pytest.mark.parametrize(
+    ("size", "said"), [(0.0, "0 m"), (1e-304, "m"), (4e-10, "0.790 nm|0.80. nm|0.79. nm")]
+)
+def test_points_closer_than_atoms_are_refused(size, said):
+    """A cloud in a unit that it does not have; squares of the least vanish, and no form is left."""
+    at = placed(Flat(), Placement(), portion(size / 6e-3 * np.stack([X, Y, 0 * X])))
+    with pytest.raises(DataError, match=f"within .*{said}.*check the units of the cloud"):
+        usable(at, None)
+
+
 def placed_at(x, y):
     nothing = np.zeros((3, len(x)))
     return Placed(x, y, 0 * x, nothing, nothing)

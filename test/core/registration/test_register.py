@@ -318,7 +318,7 @@ def test_the_aperture_leaves_out_what_lies_beyond():
         (Portion(*np.zeros((3, 0)), np.empty((0, 0))), "0 points"),
         (Portion(*np.zeros((3, 50)), np.empty((0, 50))), "50 points"),
         (Portion(*np.full((3, 500), np.nan), np.empty((0, 500))), r"0 points lie"),
-        (Portion(*np.zeros((3, 500)), np.empty((0, 500))), "few places .*measure across"),
+        (Portion(*np.zeros((3, 500)), np.empty((0, 500))), "within 0 m .*measure across"),
         (
             scan(Sphere(0.1))._replace(x=spiral()[0] * 100, y=spiral()[1] * 100),
             "settle|lie on the nominal",

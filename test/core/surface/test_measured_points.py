@@ -19,6 +19,14 @@ def test_places_that_are_no_numbers_are_missing_like_heights():
     assert (len(found), found.missing) == (1, 3)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_signalling_nan_of_single_precision_is_a_height_that_is_missing():
+    """Damaged files hold them, and a warning of NumPy is no line that a user can use."""
+    height = np.array([0x3F800000, 0x7F800001], np.uint32).view(np.float32)
+    found = measured(np.zeros(2), np.arange(2.0), height)
+    assert (len(found), found.missing) == (1, 1)
+
+
 def test_points_that_stand_there_again_count_once_and_a_note_says_so():
     rng = np.random.default_rng(1)
     x, y, height = rng.normal(size=(3, 500)) * 1e-3

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
 from itertools import pairwise
 
 import matplotlib
@@ -116,3 +119,16 @@ def test_axes_are_as_far_apart_as_their_texts_need_however_many_there_are():
         places = [one.get_position() for one in axes[:, 0]]
         gaps += [height * (upper.y0 - lower.y1) for upper, lower in pairwise(places)]
     np.testing.assert_allclose(gaps, gaps[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "around", [{"HOME": "/nonexistent"}, {"MPLBACKEND": "of_another_program"}], ids=str
+)
+def test_what_surrounds_a_command_costs_no_figure_and_no_line_on_stderr(around):
+    """A service has no home, and a notebook's backend stays set in shells that it opens."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("MPLCONFIGDIR", "XDG_CONFIG_HOME")}
+    drawn = "from omsm_ros.report.common import style; style.png(style.figure(4, 3)[0])"
+    done = subprocess.run(
+        [sys.executable, "-c", drawn], env=kept | around, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
