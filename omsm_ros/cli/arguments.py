@@ -15,6 +15,8 @@ from omsm_ros.storage.maps.length_units import LengthUnits, units_of
 from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 
 _LONGEST_MESSAGE = 480
+TABLE_SUFFIX = ".csv"
+"""By which a table is told from a bag, in small or capital letters."""
 
 
 class UsageError(ConfigurationError):

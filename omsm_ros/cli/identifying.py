@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
+    TABLE_SUFFIX,
     add_bags,
     add_by_stamps,
     add_trigger,
@@ -42,7 +43,6 @@ from omsm_ros.storage.calibration_file import save_calibration
 from omsm_ros.storage.files import whole_file
 from omsm_ros.storage.model_file import load_model, save_model
 
-TABLE_SUFFIX = ".csv"
 ENCODER = "encoder"
 _MAX_DELAY = 3
 

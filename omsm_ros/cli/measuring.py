@@ -10,6 +10,7 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
+    TABLE_SUFFIX,
     add_bags,
     add_by_stamps,
     add_polarity,
@@ -47,11 +48,13 @@ from omsm_ros.storage.surface_file import load_surface
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
 
-def sources_of(text: str) -> MachineSources:
+def sources_of(text: str | None) -> MachineSources:
     """Return what is uncertain of the machine: from a file, or from JSON that stands there."""
+    if text is None:
+        return MachineSources()
     if text.lstrip().startswith("{"):
         return declared_sources(strict_json.object_of(text, ConfigurationError, "--sources"))
-    return load_sources(text) if text else MachineSources()
+    return load_sources(text)
 
 
 def geometry_of(path: Path | None) -> Geometry:
@@ -100,7 +103,6 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
 def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--sources",
-        default="",
         metavar="SOURCES.yaml",
         help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
     )
@@ -216,7 +218,7 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
 
 def _predict(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    if args.motion.suffix == ".csv":
+    if args.motion.suffix.lower() == TABLE_SUFFIX:
         refuse_cell(args.motion, args)
         z, period = load_motion(args.motion)
         path = ScanPath(z=z, sample_period=period)

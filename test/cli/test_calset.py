@@ -84,6 +84,14 @@ def test_what_makes_no_set_is_refused_on_one_line(capsys, tmp_path, calibrations
     assert "\n" not in said
 
 
+def test_sources_of_no_name_are_refused(capsys, tmp_path, scan, calibrations):
+    """A variable of the shell that is not set: what the machine leaves open would go without."""
+    words = ["correct", scan, "--calibration", calibrations[0], "--out", tmp_path / "r"]
+    assert cli.main([*map(str, words), "--sources", ""]) == 2
+    assert capsys.readouterr().err == "omsm: no sources at ''; check the path\n"
+    assert not (tmp_path / "r").exists()
+
+
 def test_sources_in_a_file_reach_points_budget_and_light(capsys, tmp_path, scan, calibrations):
     files = {"machine.yaml": SOURCES, "mirror.yaml": MIRROR}
     for name, text in files.items():

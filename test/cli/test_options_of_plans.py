@@ -93,6 +93,12 @@ def predicted(capsys, sine, calibration, limits="", *more):
     return facts(capsys, *words)
 
 
+def test_a_planned_motion_may_be_named_in_capitals(capsys, sine, calibration):
+    """As programs of other systems name what they write."""
+    expected = predicted(capsys, sine, calibration)
+    assert predicted(capsys, sine.rename(sine.with_suffix(".CSV")), calibration) == expected
+
+
 def test_limits_of_the_machine_are_held_against_the_motion(capsys, sine, calibration):
     omega = 2 * math.pi * FREQUENCY_HZ
     text = "z_acceleration: {}\nz_jerk: {}\n"
