@@ -44,6 +44,8 @@ def load_fields(path: Path | str) -> ScanFields:
             # Where nobody says which are upper bounds, each may be one.
             bounds = content["bounds"] if "bounds" in content else np.unique(names)
             aligned = content.get("aligned", ())
+            if np.iscomplexobj(fields) or every.ndim:
+                raise ValueError("a field is complex, or its spacing is no single number")
             values = fields.astype(np.float64)
         found = ScanFields(
             tuple(map(str, names)),

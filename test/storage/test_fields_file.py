@@ -52,6 +52,8 @@ def test_a_member_that_is_no_array_is_refused(tmp_path):
         {"names": np.array(["tilt"]), "fields": np.zeros((1, 3)), "every": 0},
         {"names": np.array(["tilt"]), "fields": np.full((1, 3), np.nan), "every": 1},
         {"names": np.array(["tilt"]), "fields": np.zeros((1, 3))},
+        {"names": np.array(["tilt"]), "fields": np.full((1, 3), 1e-9j), "every": 1},
+        {"names": np.array(["tilt"]), "fields": np.zeros((1, 3)), "every": [[1]]},
         {"names": np.array(["tilt"]), "fields": np.array([["a"]]), "every": 1},
         {"names": np.array([{}], dtype=object), "fields": np.zeros((1, 3)), "every": 1},
     ],
