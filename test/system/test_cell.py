@@ -92,6 +92,8 @@ def test_killed_and_restarted_emulator(cell, true_calibration):
     cell.processes.end("cell_emulator", how=signal.SIGKILL)
     before = cell.settle("corrector", "axes_received")
     assert before < 20_000
+    # It plays no longer, whatever it said last.
+    cell.operator._status.pop("cell_emulator", None)
 
     cell.start_emulator()
     reconnected(cell)
