@@ -8,6 +8,7 @@ samples has no noise to speak of.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy import fft
 from omsm_ros.core.dynamics.transfer_function import ComplexArray
 from omsm_ros.core.fitting.descent import Effort
 from omsm_ros.core.fitting.output_error import Fit, Problem
+from omsm_ros.core.fitting.steps import Edge
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
 # Width of the intervals that must have a value in common, in standard deviations. On quintic steps
@@ -24,20 +26,23 @@ _INTERVAL = 2.0
 # Standard deviations beyond which a part that is followed, or is not, is no chance. Noise that
 # shows less imitates no departure that would be significant.
 _CLEARLY = 5.0
+# Those beyond which a mean over all edges is no chance in a hundred samples after each.
+_SEEN = 3.0
 # Of a record's spectrum: dozens of bands, the lowest of so many lines that they tell their noise.
 _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 
 
-def without_unfollowed(problem: Problem, fitted: Fit) -> Problem | None:
+def without_unfollowed(problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()) -> Problem | None:
     """Return the problem without that part of the input's noise that the probe did not follow.
 
+    edges: of the input, if it has any
     fitted: to ``problem``; its residual shows how much of that noise did not come through it.
         Where some of it did, its expected motion stays (Carroll et al. 2006, ch. 4).
     None where the probe followed all, as far as the residual shows, or it was taken out before.
     """
     if problem.noise <= 0 or problem.unfollowed is not None:
         return None
-    smooth, left = smoothed(problem.input, problem.noise)
+    smooth, left = smoothed(problem.input, problem.noise, edges)
     noise = problem.input - smooth
     quiet = replace(problem, input=smooth, noise=left)
     made = np.where(problem.used, problem.modelled(fitted) - quiet.modelled(fitted), 0.0)
@@ -99,14 +104,17 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def smoothed(positions: FloatArray, noise: float) -> tuple[FloatArray, float]:
+def smoothed(
+    positions: FloatArray, noise: float, edges: Sequence[Edge] = ()
+) -> tuple[FloatArray, float]:
     """Return ``positions`` (n,) [m] as their means where they rest, and the noise that is left [m].
 
-    noise: standard deviation of a sample, white [m]
+    noise: standard deviation of a sample, white [m];  edges: where they move, if they do in steps
 
     Of the samples before and after, each as many are taken as agree with a constant: the intervals
     of their means intersect (Goldenshluger and Nemirovski 1997). So an edge keeps its shape, and a
-    motion that stands out of the noise stays.
+    motion that stands out of the noise stays. How an axis comes to rest does not; what of it is
+    alike at all edges, and stands out of the noise of their mean, is given back.
     """
     middle = float(np.mean(positions))
     rest = positions - middle
@@ -115,7 +123,34 @@ def smoothed(positions: FloatArray, noise: float) -> tuple[FloatArray, float]:
     # Both hold the sample itself.
     count = earlier + later[::-1] - 1
     mean = (earlier * before + later[::-1] * after[::-1] - rest) / count
-    return np.asarray(mean + middle), noise * float(np.sqrt(np.mean(1 / count)))
+    alike, left = _alike(rest - mean, noise, edges)
+    return np.asarray(mean + alike + middle), noise * float(np.sqrt(np.mean(1 / count + left)))
+
+
+def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[FloatArray, FloatArray]:
+    """Return what of ``taken`` (n,) is alike at all ``edges``, by their heights, (n,).
+
+    The second is the share of the variance of ``noise`` in it, (n,). Noise that all edges had alike
+    would show in no residual: nothing is returned that may be noise.
+    """
+    alike, left = np.zeros((2, len(taken)))
+    if not edges:
+        return alike, left
+    # As long again as an edge takes it may come to rest.
+    length = 2 * max(edge.stop - edge.start for edge in edges)
+    ends = [edge.start for edge in edges[1:]] + [len(taken)]
+    parts = [slice(e.start, min(e.start + length, end)) for e, end in zip(edges, ends, strict=True)]
+    moved, power = np.zeros((2, length))
+    for edge, part in zip(edges, parts, strict=True):
+        moved[: part.stop - part.start] += edge.height * taken[part]
+        power[: part.stop - part.start] += edge.height**2
+    seen = np.abs(moved) > _SEEN * noise * np.sqrt(power)
+    for edge, part in zip(edges, parts, strict=True):
+        within = slice(part.stop - part.start)
+        scale = np.where(seen[within], edge.height / power[within], 0.0)
+        alike[part] = scale * moved[within]
+        left[part] = scale * edge.height
+    return alike, left
 
 
 def _mean_before(values: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:

@@ -146,7 +146,7 @@ def _again(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, 
 
 def _quieter(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
     """Return both without the encoder's own noise, if that describes more."""
-    problem = without_unfollowed(prepared.problem, model.chosen.fit)
+    problem = without_unfollowed(prepared.problem, model.chosen.fit, prepared.steps.edges)
     if problem is None:
         return prepared, model
     quieter = replace(prepared, problem=problem)

@@ -9,6 +9,7 @@ from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import evaluated, fit
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.fitting.steps import find_steps
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.samples.motion_record import MotionRecord
 
@@ -174,3 +175,22 @@ def test_a_quiet_encoder_is_not_spoken_of():
     certificate = identify(record_of(staircase(500), 0.01e-9)).calibration.certificate
     assert certificate["encoder_noise_m"] is None
     assert not any("did not follow" in warning for warning in certificate["warnings"])
+
+
+@pytest.mark.parametrize("tail", [1.0, 2.0, 6.0])
+def test_how_an_axis_comes_to_rest_is_not_lost_in_its_noise(tail):
+    """Steps that end as a servo does, by a power of e each ``tail`` samples: what is taken out of
+    the positions averages to nothing. Lost, it would be a lag of its own."""
+    rest, edges, noise = 480, 400, 0.4e-9
+    phase = np.clip(np.arange(rest + RAMP) / RAMP, 0.0, 1.0)
+    edge = phase**3 * (10 - 15 * phase + 6 * phase**2)
+    edge = signal.lfilter([1 - np.exp(-1 / tail)], [1, -np.exp(-1 / tail)], edge)
+    up = np.where(np.arange(edges) % 2 == 0, 1.0, -1.0)
+    start = np.repeat((1 - up) / 2, len(edge))
+    z = STEP * (start + np.repeat(up, len(edge)) * np.tile(edge, edges))
+    noisy = z + np.random.default_rng(3).normal(0, noise, len(z))
+    found = find_steps(noisy, PERIOD).edges
+    lost = (z - smoothed(noisy, noise, found)[0]).reshape(edges, -1) * up[:, np.newaxis]
+    after = lost[:, RAMP : RAMP + 160].sum(axis=1)
+    # A mean of all that agree loses two to five times as much.
+    assert abs(np.mean(after)) < noise * tail
