@@ -18,6 +18,7 @@ from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.at_work import at_work
+from omsm_ros.cli.ending import AskedToEndError, end_as_asked, interrupted_when_asked
 from omsm_ros.cli.overwriting import check_outputs
 from omsm_ros.cli.printing import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
@@ -171,8 +172,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OmsmError as err:
         _complain(too_many_open_files(err) or str(err))
         return BAD_INPUT
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as err:
         _complain(INTERRUPTION)
+        if isinstance(err, AskedToEndError):
+            end_as_asked(err.number)
         return INTERRUPTED
     except BrokenPipeError:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
@@ -232,7 +235,7 @@ def _run(args: argparse.Namespace) -> int:
     check_outputs(args)
     if args.command == DEMO:
         return _demo(args)
-    with at_work(f"omsm {args.command}", args.json):
+    with interrupted_when_asked(), at_work(f"omsm {args.command}", args.json):
         facts = args.run.act(args)
     _tell(args, facts)
     if refusal := args.run.refusal(facts):
