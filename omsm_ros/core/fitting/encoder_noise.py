@@ -28,6 +28,7 @@ _INTERVAL = 2.0
 _CLEARLY = 5.0
 # Those beyond which a mean over all edges is no chance in a hundred samples after each.
 _SEEN = 3.0
+_TINY = float(np.finfo(np.float64).tiny)
 # Of a record's spectrum: dozens of bands, the lowest of so many lines that they tell their noise.
 _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 
@@ -90,12 +91,11 @@ def _shares(
 
     The second is the standard deviation of each, from what else there is to see.
     """
-    tiny = float(np.finfo(np.float64).tiny)
-    power = np.maximum(np.bincount(band, np.abs(expected) ** 2), tiny)
+    power = np.maximum(np.bincount(band, np.abs(expected) ** 2), _TINY)
     share = np.bincount(band, -(seen * expected.conj()).real) / power
     rest = seen + share[band] * expected
     spread = np.sqrt(np.bincount(band, 0.5 * np.abs(rest * expected) ** 2)) / power
-    return np.asarray(share, np.float64), np.asarray(np.maximum(spread, tiny), np.float64)
+    return np.asarray(share, np.float64), np.asarray(np.maximum(spread, _TINY), np.float64)
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
@@ -147,7 +147,8 @@ def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[Floa
     seen = np.abs(moved) > _SEEN * noise * np.sqrt(power)
     for edge, part in zip(edges, parts, strict=True):
         within = slice(part.stop - part.start)
-        scale = np.where(seen[within], edge.height / power[within], 0.0)
+        # Where all come back to where they were, nothing is seen, and there is no power either.
+        scale = np.where(seen[within], edge.height / np.maximum(power[within], _TINY), 0.0)
         alike[part] = scale * moved[within]
         left[part] = scale * edge.height
     return alike, left

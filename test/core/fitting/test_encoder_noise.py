@@ -9,7 +9,7 @@ from omsm_ros.core.fitting.model_structure import Structure
 from omsm_ros.core.fitting.output_error import evaluated, fit
 from omsm_ros.core.fitting.preparation import prepare
 from omsm_ros.core.fitting.starting_points import StartingPoints
-from omsm_ros.core.fitting.steps import find_steps
+from omsm_ros.core.fitting.steps import Edge, find_steps
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.samples.motion_record import MotionRecord
 
@@ -194,3 +194,13 @@ def test_how_an_axis_comes_to_rest_is_not_lost_in_its_noise(tail):
     after = lost[:, RAMP : RAMP + 160].sum(axis=1)
     # A mean of all that agree loses two to five times as much.
     assert abs(np.mean(after)) < noise * tail
+
+
+def test_moves_that_come_back_to_where_they_were_are_no_steps():
+    """Edges without a height: nothing is alike at them, by their heights."""
+    noisy = np.random.default_rng(5).normal(0, 1e-9, 1000)
+    noisy[[300, 700]] = STEP
+    edges = [Edge(290, 310, 0.0), Edge(690, 710, 0.0)]
+    with_edges, without = smoothed(noisy, 1e-9, edges), smoothed(noisy, 1e-9)
+    np.testing.assert_array_equal(with_edges[0], without[0])
+    assert with_edges[1] == without[1]
