@@ -143,17 +143,22 @@ def test_messages_of_another_definition_are_saved_as_they_are(whole, tmp_path):
     assert (made.messages, made.lost) == (dict.fromkeys(TOPICS, BLOCKS), [])
 
 
-def test_messages_that_were_compressed_one_by_one_can_be_read(tmp_path, small_scan_blocks):
-    """That they are is said by metadata.yaml alone, and the copy is one file."""
-    store, folder = message_types.typestore(), tmp_path / "night"
-    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
-    kind = bags.TOPIC_TYPES[bags.AXES_TOPIC]
+def write_axes(writer, pairs):
+    """What rosbag2 writes of the axes, with its own writer."""
+    store, kind = message_types.typestore(), bags.TOPIC_TYPES[bags.AXES_TOPIC]
     with writer:
         connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)
-        for axes, _ in small_scan_blocks[:5]:
+        for axes, _ in pairs:
             message = conversions.axis_message(message_types.bag_messages(), axes)
             writer.write(connection, axes.stamp_ns, store.serialize_cdr(message, kind))
+
+
+def test_messages_that_were_compressed_one_by_one_can_be_read(tmp_path, small_scan_blocks):
+    """That they are is said by metadata.yaml alone, and the copy is one file."""
+    folder = tmp_path / "night"
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    write_axes(writer, small_scan_blocks[:5])
     made = repair(folder)
     assert made.lost == []
     assert first_samples(made.path) == [axes.first_sample for axes, _ in small_scan_blocks[:5]]
@@ -185,16 +190,11 @@ def test_a_bag_without_index_gets_one(tmp_path, small_scan_blocks):
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_folder_of_rosbag2_without_its_metadata(tmp_path, small_scan_blocks, packed):
     """As rosbag2 leaves it when it is killed: no metadata.yaml, no end."""
-    store, folder = message_types.typestore(), tmp_path / "night"
+    folder = tmp_path / "night"
     writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
     if packed:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    kind = bags.TOPIC_TYPES[bags.AXES_TOPIC]
-    with writer:
-        connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)
-        for axes, _ in small_scan_blocks[:5]:
-            message = conversions.axis_message(message_types.bag_messages(), axes)
-            writer.write(connection, axes.stamp_ns, store.serialize_cdr(message, kind))
+    write_axes(writer, small_scan_blocks[:5])
     (folder / "metadata.yaml").unlink()
     part = folder / "night.mcap"
     part.write_bytes(part.read_bytes()[: ends_of_chunks(part)[-1]])
