@@ -14,6 +14,7 @@ def test_a_command_that_is_asked_to_end_leaves_no_unfinished_file(tmp_path, aske
     """And ends by that signal, as who has started it expects."""
     block = (
         "import os, signal, sys\n"
+        f"signal.signal(signal.{asked}, signal.SIG_DFL)\n"  # whoever runs the tests below nohup
         "replaced = os.replace\n"
         "def asked(part, target):\n"
         f"    os.kill(os.getpid(), signal.{asked})\n"
