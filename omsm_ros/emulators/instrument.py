@@ -18,6 +18,7 @@ import numpy as np
 
 from omsm_ros.core.samples.blocks import Status
 from omsm_ros.emulators.sources import Measured, NumberedSource, Source
+from omsm_ros.errors import DeviceError
 from omsm_ros.units import NANOSECONDS_PER_S, PPM
 
 # Samples are written this often; shorter costs processor time, longer bunches arrivals.
@@ -160,6 +161,14 @@ class Instrument:
         if now < self._quiet_until:
             self._measure(now)
             return
+        try:
+            self._exchange(now, stop)
+        except (DeviceError, OSError):
+            # The cable may be pulled, by another thread, while something is on its way.
+            if self._clock() >= self._off_until:
+                raise
+
+    def _exchange(self, now: float, stop: threading.Event | None) -> None:
         self.work()
         data = self._line.read()
         if self._line.sessions != self._session:
@@ -200,9 +209,9 @@ class Instrument:
 
     def unplug(self, seconds: float) -> None:
         """Take the cable out for a while; the device measures on."""
+        self._off_until = self._clock() + seconds
         self._line.unplug()
         self._unplugged = True
-        self._off_until = self._clock() + seconds
 
     def power_cycle(self, seconds: float) -> None:
         """Switch off for a while, then on as from the factory, counting from zero."""

@@ -122,3 +122,24 @@ def test_a_reference_is_read_beside_its_command_port() -> None:
         assert device.statistics.lost == 0
         assert got[0].axes is None
         assert device.identity["model"].startswith("$VERDT6230")
+
+
+def test_a_cable_that_is_pulled_while_something_is_sent_ends_nothing(tmp_path: Path) -> None:
+    """Whoever pulls it is another thread than that which serves, so it may be at any place."""
+    with line_for(str(tmp_path / "probe")) as line:
+        emulator = ChrocodileEmulator(line)
+        sent = line.write
+
+        def pulled(data: bytes, stop: threading.Event | None = None) -> int:
+            emulator.unplug(0.2)
+            return sent(data, stop)
+
+        line.write = pulled  # type: ignore[method-assign]
+        wait_until = time.monotonic() + 10.0
+        while line._master is not None:
+            assert time.monotonic() < wait_until
+            emulator.step()
+        line.write = sent  # type: ignore[method-assign]
+        time.sleep(0.25)
+        emulator.step()
+        assert line._master is not None
