@@ -1,8 +1,8 @@
 """``omsm``: the offline commands.
 
 Exit status 0: done; 2: bad input, with one line on stderr that says what to do; 70: a defect
-of ours, with one line on stderr that says what to report; 130: interrupted;
-SIGTERM and SIGHUP end it as they do, and it removes what is unfinished. With ``--json`` standard
+of ours, with one line on stderr that says what to report; 130: interrupted.
+After SIGTERM and SIGHUP it removes what is unfinished and ends by them. With ``--json`` standard
 output holds one JSON object and nothing else.
 """
 

@@ -61,7 +61,7 @@ _NEEDED = (topics.AXES_TOPIC, topics.DISTANCE_TOPIC)
 _SAMPLES = (*_NEEDED, topics.REFERENCE_TOPIC)
 _TICK_S = 0.005
 _LATE_S = 1.0
-# An answer is on its way so long, on a busy computer; one who ends before takes it along.
+# An answer may take so long on a busy computer; a node that ends before loses it.
 _ANSWER_S = 1.0
 
 

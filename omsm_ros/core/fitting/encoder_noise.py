@@ -21,7 +21,7 @@ from omsm_ros.core.fitting.steps import Edge
 from omsm_ros.core.samples.blocks import FloatArray, IntArray
 
 # Width of the intervals that must have a value in common, in standard deviations. On quintic steps
-# with noise of 1 and 3 nm two leaves least: 0.15 of it, and nothing that repeats at each step.
+# with noise of 1 and 3 nm two leaves least: 0.15 of it, and of quintic edges nothing that repeats.
 _INTERVAL = 2.0
 # Standard deviations beyond which a part that is followed, or is not, is no chance. Noise that
 # shows less imitates no departure that would be significant.

@@ -89,8 +89,10 @@ def chosen_alike(problem: Problem, before: Model) -> Model | None:
     """Return ``before``, which was chosen while the problem was another, fitted to it as it is.
 
     None where the change lets some candidates describe more than others: then a structure that
-    was not tried may describe more too.
+    was not tried may describe more too. None also where an order was asked for.
     """
+    if before.free is not None:
+        return None
     best = min(c.bic for c in before.candidates)
     changes, candidates = [], []
     for known in before.candidates:
@@ -99,7 +101,7 @@ def chosen_alike(problem: Problem, before: Model) -> Model | None:
         if known.bic < best + _MAY_BE_CHOSEN_BIC:
             changes.append(change)
         candidates.append(Candidate(now, known.bic + change))
-    if before.free is not None or max(changes) - min(changes) > _ALIKE_BIC:
+    if max(changes) - min(changes) > _ALIKE_BIC:
         return None
     fitted, nonlinear = before.chosen.fit, before.chosen.fit.nonlinear
     again = fit(problem, fitted.structure, [nonlinear])
