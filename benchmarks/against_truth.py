@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.row import Row, at_least, between, not_compared, shown
-from omsm_ros.core.dynamics.calibration import REJECTED, Calibration
-from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass, fit_two_mass
-from omsm_ros.core.dynamics.modes import known_modes
-from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.calibration.calibration import REJECTED, Calibration
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
+from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass, known_modes
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
 
 def mode_errors(

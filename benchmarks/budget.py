@@ -23,20 +23,19 @@ from benchmarks.drawn_machine import (
     stated,
 )
 from benchmarks.row import Row, between, shown
+from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
 from omsm_ros.core.correction.budget import scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.scan_fields import ScanFields, scan_fields
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.correction.systematic import ScanFields, scan_fields
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, with_latency
 from omsm_ros.core.form.analyse import Form, analyse_form
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.registration.placement import Portion
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.cell import Cell, Recording, record
-from omsm_ros.twin.figure_error import FigureError
+from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Scenario, planned_test_of, spiral_of
 from omsm_ros.units import NANOMETRE_M
 

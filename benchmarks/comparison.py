@@ -15,17 +15,16 @@ import numpy as np
 
 from benchmarks.correction import identified_calibration
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.jobs.compare_measurements import ComparisonOptions, compare_measurements
-from omsm_ros.jobs.measure import measure
-from omsm_ros.storage import bags
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.pipelines.compare_measurements import ComparisonOptions, compare_measurements
+from omsm_ros.pipelines.measure import measure
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.figure_error import FigureError
 from omsm_ros.twin.machine_errors import Drift, MachineErrors
+from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Spiral
 from omsm_ros.units import NANOMETRE_M
 

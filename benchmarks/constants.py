@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.identification import record_once
-from omsm_ros.core.departures.hidden import PAPER_SCAN
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.undetected import PAPER_SCAN
+from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
 from omsm_ros.twin.catalogue import CATALOGUE
@@ -30,7 +30,7 @@ from omsm_ros.units import NANOMETRE_M
 _SEED = 12_000
 _DISTURBED = ("creep, 0.2 s", "base mode, 8 Hz", "backlash", "friction", "vibration, 13.7 Hz")
 _MEDIUM = 1
-_ROOT = "omsm_ros.core.departures"
+_ROOT = "omsm_ros.core.model_errors"
 _PLACES = {
     "FASTEST_CREEP_S": f"{_ROOT}.families",
     "_CREEPS_A_DECADE": f"{_ROOT}.families",
@@ -42,16 +42,16 @@ _PLACES = {
     "_MOST_CYCLES": f"{_ROOT}.families",
     "_DRIFT_DEGREES": f"{_ROOT}.families",
     "_LINES_TRIED": f"{_ROOT}.families",
-    "_NOISE_HALF_GAP": f"{_ROOT}.hysteresis",
-    "_IMITATED": f"{_ROOT}.residual_space",
-    "_LEAST_LINES": f"{_ROOT}.residual_space",
-    "_HALF_WIDTH": f"{_ROOT}.residual_space",
-    "FALSE_ALARM": f"{_ROOT}.survey",
-    "_LAGS": f"{_ROOT}.survey",
-    "_MOST_ROUNDS": "omsm_ros.core.identification.departure_search",
-    "_UNDECIDED": "omsm_ros.core.identification.departure_search",
-    "_LEAST_DECAYS": "omsm_ros.core.identification.departure_search",
-    "_PLAIN_POLES": "omsm_ros.core.identification.departure_search",
+    "_NOISE_HALF_GAP": f"{_ROOT}.families",
+    "_IMITATED": f"{_ROOT}.residual_diagnostics",
+    "_LEAST_LINES": f"{_ROOT}.residual_diagnostics",
+    "_HALF_WIDTH": f"{_ROOT}.residual_diagnostics",
+    "FALSE_ALARM": f"{_ROOT}.residual_diagnostics",
+    "_LAGS": f"{_ROOT}.residual_diagnostics",
+    "_MOST_ROUNDS": "omsm_ros.core.identification.model_error_search",
+    "_UNDECIDED": "omsm_ros.core.identification.model_error_search",
+    "_LEAST_DECAYS": "omsm_ros.core.identification.model_error_search",
+    "_PLAIN_POLES": "omsm_ros.core.identification.model_error_search",
 }
 
 

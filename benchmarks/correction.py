@@ -9,20 +9,19 @@ import numpy as np
 from scipy import signal
 
 from benchmarks.row import Row, at_most, shown
+from omsm_ros.core.adjustment.resolved_calibration import reversal
+from omsm_ros.core.adjustment.scan_reader import read_scan
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import bilinear, discretise
-from omsm_ros.core.dynamics.discretisation_error import discretisation_error
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.lti.discretisation import bilinear, discretisation_error, discretise
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.verification.reversal import reversal
-from omsm_ros.core.verification.scan_reader import read_scan
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
 
 # Unit of s in the columns, which are alike in size then [rad/s].
 _RATE = 1e3

@@ -12,16 +12,19 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_least, at_most
-from omsm_ros.devices.factory import defaults, make_device
-from omsm_ros.emulators.chrocodile import ChrocodileEmulator
-from omsm_ros.emulators.chrocodile_packet import ChrocodilePacketEmulator
-from omsm_ros.emulators.players import emulated, line_for
 from omsm_ros.errors import DeviceError
-from omsm_ros.protocols.chrocodile_decoder import BinaryDecoder
-from omsm_ros.protocols.chrocodile_packet import DataFormat, encode_data, encode_format
-from omsm_ros.protocols.chrocodile_packet_decoder import PacketDecoder
-from omsm_ros.protocols.chrocodile_telegram import ENCODERS_AT_START, Layout
-from omsm_ros.protocols.generic_stream import FRAME, FrameDecoder, encode_frames
+from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
+from omsm_ros.instruments.chrocodile.packet_protocol import (
+    DataFormat,
+    PacketDecoder,
+    encode_data,
+    encode_format,
+)
+from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder
+from omsm_ros.instruments.chrocodile.telegram import ENCODERS_AT_START, Layout
+from omsm_ros.instruments.emulator_factory import emulated, line_for
+from omsm_ros.instruments.factory import defaults, make_device
+from omsm_ros.instruments.six_channel.protocol import FRAME, FrameDecoder, encode_frames
 
 QUICK_S, FULL_S = 20.0, 300.0
 # Counter, distance in nm, five encoders: 28 bytes a telegram.

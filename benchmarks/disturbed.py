@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_most, shown
-from omsm_ros.core.departures.hidden import PAPER_SCAN
-from omsm_ros.core.dynamics.calibration import REJECTED, Calibration
-from omsm_ros.core.dynamics.response_band import response_band
+from omsm_ros.core.calibration.calibration import REJECTED, Calibration
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.model_errors.undetected import PAPER_SCAN
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together

@@ -11,12 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
-from omsm_ros.core.departures.families import CREEP, MODE
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.model_errors.families import CREEP, MODE
 from omsm_ros.core.surface.nominal import PAPER_MIRROR_RADIUS_M
-from omsm_ros.twin.clocks import ClockErrors
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.encoder import EncoderErrors, Pitch
 from omsm_ros.twin.machine_errors import (
     Drift,
     Harmonic,
@@ -24,8 +22,9 @@ from omsm_ros.twin.machine_errors import (
     SpindleError,
     Straightness,
 )
-from omsm_ros.twin.part_pose import PartPose
+from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.probe import ProbeErrors
+from omsm_ros.twin.sensors import ClockErrors, EncoderErrors, Pitch
 from omsm_ros.twin.structure import Creep, SoftMode, StructureErrors
 from omsm_ros.twin.vibration import VibrationLine
 from omsm_ros.units import PPM

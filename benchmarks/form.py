@@ -22,19 +22,26 @@ import numpy as np
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.form.analyse import Form, analyse_form
-from omsm_ros.core.form.removal import without_second_order
+from omsm_ros.core.form.part_figures import without_second_order
 from omsm_ros.core.form.zernike_fit import fit_zernikes
-from omsm_ros.core.machine.surface_height import Surface
+from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.placement import Aperture, Portion
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    PAPER_MIRROR_RADIUS_M,
+    Flat,
+    Sphere,
+    XYPolynomial,
+    XYTerm,
+    ZernikeSurface,
+)
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.core.surface.zernike_terms import first_terms, zernike_values
-from omsm_ros.storage.cloud_file import PlyWriter
-from omsm_ros.storage.maps.read_map import read_points
-from omsm_ros.twin.part_pose import PartPose, posed
+from omsm_ros.io.maps.read_map import read_points
+from omsm_ros.io.results import PlyWriter
+from omsm_ros.twin.part import PartPose, posed
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 RADIUS, NOISE = PAPER_MIRROR_RADIUS_M, 10 * NANOMETRE_M

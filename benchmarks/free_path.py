@@ -12,10 +12,10 @@ import numpy as np
 
 from benchmarks.against_truth import band_held
 from benchmarks.row import Row, at_most
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import Chirp, Motion, Multisine
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import Chirp, Motion, Multisine
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant

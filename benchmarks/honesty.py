@@ -15,13 +15,13 @@ from scipy import signal
 
 from benchmarks.correction import blocks_of, fast_path, identified_calibration
 from benchmarks.row import Row, at_most, between, shown
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.lti.discretisation import discretise
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant

@@ -19,15 +19,14 @@ from benchmarks.against_truth import (
 )
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.response_band import COVERAGE_FACTOR, response_band
-from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.fitting.covariance import hidden_motion_covariance
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.estimation.covariance import hidden_motion_covariance
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.step_plan import StepPlan, plan_steps
-from omsm_ros.core.machine.trajectories import Motion, StepTest
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import Motion, StepPlan, StepTest, plan_steps
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant, respond

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.row import Row, at_least, at_most
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 # One turn of the spindle at 30 rpm: the blocks of a turn are published over and over.
@@ -63,17 +63,16 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
     import rclpy
     from omsm_msgs import msg
 
-    from omsm_ros.nodes.cell_demo_node import DemoNode
-    from omsm_ros.nodes.processes import NodeProcesses
+    from omsm_ros.nodes.cell_demo_node import DemoNode, NodeProcesses
     from omsm_ros.nodes.topics import SAMPLES_QOS
 
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     folder = Path(tempfile.mkdtemp())
     _calibration(folder / "cal.json", rate)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
     turn = [
-        (conversions.axis_message(messages, a), conversions.distance_message(messages, d))
+        (message_mapping.axis_message(messages, a), message_mapping.distance_message(messages, d))
         for a, d in _turn(rate, size)
     ]
     rclpy.init()

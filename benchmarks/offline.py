@@ -17,13 +17,12 @@ from rosbags.rosbag2 import Reader
 from scipy import signal
 
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
-from omsm_ros.storage import bags
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.conversions import axis_message, distance_message
-from omsm_ros.storage.message_types import bag_messages
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.io.message_mapping import axis_message, bag_messages, distance_message
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
 from omsm_ros.units import NANOSECONDS_PER_S
 

@@ -19,11 +19,11 @@ from benchmarks.against_truth import (
 )
 from benchmarks.identification import record_once, rms, seeds
 from benchmarks.row import Row, at_least, at_most, between
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.modes import FITTED, TwoMass
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.twin.plant import Plant
 
 MACHINE = TwoMass(m1=10.0, m2=2.0, k1=2e6, k2=4e5, c1=450.0, c2=60.0)

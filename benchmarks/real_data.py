@@ -29,7 +29,7 @@ from scipy import linalg, signal
 
 from benchmarks.row import Row, at_least, shown
 from omsm_ros import cli
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "daisy"
 PERIODS_S = {"robotArm": 1.0, "hairdryer": 0.08, "ballbeam": 0.1}

@@ -8,22 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.row import Row, at_least, shown
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import latency_of
-from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.core.verification.resolved_calibration import (
+from omsm_ros.core.adjustment.resolved_calibration import (
     after_step_test,
     from_scans_alone,
     resolved,
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.verification.scan_reader import ScanColumns, read_scan
-from omsm_ros.core.verification.self_calibration import self_calibrate
+from omsm_ros.core.adjustment.scan_reader import ScanColumns, read_scan
+from omsm_ros.core.adjustment.self_calibration import self_calibrate
+from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.machine_errors import Drift, MachineErrors

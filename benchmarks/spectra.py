@@ -10,9 +10,11 @@ import numpy as np
 
 from benchmarks.mixtures import MadeScan, Mixture, TrueLine, mixture
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
-from omsm_ros.core.dynamics.aliasing import folded_frequency
-from omsm_ros.core.spectra.felt import felt
-from omsm_ros.core.spectra.hypotheses import (
+from omsm_ros.core.ripple.accelerometer import felt
+from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.ripple_guard import Named, name_lines, study_all
+from omsm_ros.core.ripple.scan_signal import scan_signal
+from omsm_ros.core.ripple.source_hypotheses import (
     ARTEFACT,
     FOLDED,
     PART,
@@ -21,8 +23,6 @@ from omsm_ros.core.spectra.hypotheses import (
     VIBRATION,
     StudiedScan,
 )
-from omsm_ros.core.spectra.ripple_guard import Named, name_lines, study_all
-from omsm_ros.core.spectra.scan_signal import scan_signal
 
 _FIRST_SEED = 4000
 _RECORDS = Path(__file__).parents[2] / "shared/data/vibration/pyxis_linear_stage"

@@ -17,17 +17,16 @@ from scipy import signal
 from benchmarks.correction import SOURCES, corrected, identified_calibration
 from benchmarks.identification import record_once
 from benchmarks.row import Row, at_least, at_most, not_compared
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.fitting.discrete_starts import DiscreteStarts
-from omsm_ros.core.fitting.free_run_choice import MAX_ORDER, choose_sampled
-from omsm_ros.core.fitting.held_problem import DiscreteScaled, HeldProblem
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import fit
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.sampled_choice import MAX_ORDER, choose_sampled
+from omsm_ros.core.estimation.sampled_fit import DiscreteScaled, DiscreteStarts, HeldProblem
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.discretisation import discretise
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.twin.cell import Recording, blocks_of
 
 PAPER_POINTS = 290_011

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
 from omsm_ros.core.correction.surface_points import POINT_DTYPE
-from omsm_ros.report.live.page import render
-from omsm_ros.viewing.live_view import LiveView
+from omsm_ros.live_page.live_view import LiveView
+from omsm_ros.live_page.server import render
 
 _CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 _HOURS, _RATE = 8.0, 1000
@@ -51,7 +51,7 @@ def _resident() -> float:
 def _page(view: LiveView) -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
-    from omsm_ros.viewing.server import LiveServer
+    from omsm_ros.live_page.server import LiveServer
 
     server = LiveServer(view, render("Benchmark"), "127.0.0.1", 0)
     server.start()

@@ -16,9 +16,9 @@ from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from omsm_ros.emulators.players import EMULATED, emulated
+from omsm_ros.instruments.emulator_factory import EMULATED, emulated
+from omsm_ros.io.folders import runtime_folder
 from omsm_ros.nodes.start import LAUNCHED_BY
-from omsm_ros.storage.runtime_folder import runtime_folder
 
 SHARE = Path(get_package_share_directory("omsm_ros"))
 ARGUMENTS = {

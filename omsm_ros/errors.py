@@ -17,7 +17,8 @@ them into one line on stderr and exit status 2::
         ├── DeviceTimeoutError (TimeoutError)
         └── NoSamplesError             connected, but nothing that could be read came
 
-Each text names the offending value and the remedy.
+An error carries a code and values; its text, which names the offending value and the remedy, is
+made by :mod:`omsm_ros.messages`. A text given instead of a code stays as it is.
 """
 
 import errno
@@ -25,11 +26,32 @@ import math
 import os
 import re
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+_sentence: Callable[[str, Mapping[str, Any]], str] | None = None
+
+
+def write_texts_with(sentence: Callable[[str, Mapping[str, Any]], str]) -> None:
+    """Let ``sentence(code, values)`` write the texts of errors from now on."""
+    global _sentence
+    _sentence = sentence
 
 
 class OmsmError(Exception):
-    """Base of all deliberate errors of this package."""
+    """Base of all deliberate errors of this package.
+
+    code: which error, as ``room.subject``, or its text;  values: what the text of a code needs
+    """
+
+    def __init__(self, code: object = "", /, **values: Any) -> None:
+        super().__init__(code)
+        self.code, self.values = str(code), values
+
+    def __str__(self) -> str:
+        if _sentence is None:
+            return " ".join([self.code, *(f"{k}={v!r}" for k, v in self.values.items())])
+        return _sentence(self.code, self.values)
 
 
 class DataError(OmsmError, ValueError):

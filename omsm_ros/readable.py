@@ -2,7 +2,7 @@
 
 Every text for people (messages, verdicts, tables of the command line, pages) takes its numbers
 from here. Plain characters throughout, so that a terminal shows and a search finds them; pages
-replace them by typographic ones (:mod:`omsm_ros.report.common.typography`). A number that the
+replace them by typographic ones (:mod:`omsm_ros.report.page_parts`). A number that the
 reader is to type back stays in the unit of its field instead.
 """
 

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from omsm_ros.core.spectra.coordinates import Coordinate
-from omsm_ros.core.spectra.line import Line
-from omsm_ros.core.spectra.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.coordinates import Coordinate
+from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.spectral_line import Line
 
 NM = 1e-9
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
 STEPS = StepTest()

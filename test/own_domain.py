@@ -6,8 +6,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.storage.claim import claimed
-from omsm_ros.storage.runtime_folder import runtime_folder
+from omsm_ros.io.folders import claimed, runtime_folder
 
 
 @contextmanager

@@ -15,8 +15,8 @@ from benchmarks.cramer_rao import response_bounds
 from benchmarks.parts import PARTS, measure
 from benchmarks.parts import __file__ as parts_file
 from benchmarks.row import at_least, at_most, between, shown
-from omsm_ros.core.dynamics.calibration import REJECTED
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.lti.transfer_function import TransferFunction
 
 PERIOD, NOISE, GAIN = 1e-3, 1e-8, 0.99
 TRUTH = TransferFunction.from_ascending([1.0, 1e-3], [1.0, 3e-3, 1e-5])

@@ -10,9 +10,10 @@ import yaml
 
 import omsm_ros
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
-from omsm_ros.devices import factory, sensor_factory
-from omsm_ros.storage.recording.topics import POINTS_TOPIC, TOPIC_TYPES
-from omsm_ros.storage.surface_file import load_surface
+from omsm_ros.instruments import factory
+from omsm_ros.instruments import factory as sensor_factory
+from omsm_ros.io.descriptions import load_surface
+from omsm_ros.io.topics import POINTS_TOPIC, TOPIC_TYPES
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 NO_PARAMETERS = {"paper_mirror", "disturbances", "limits"}

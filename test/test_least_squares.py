@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.least_squares import (
-    least_squares,
-    orthonormal,
-    triangle,
-    unit_columns,
-)
+from omsm_ros.linear_algebra import least_squares, orthonormal, triangle, unit_columns
 
 RANDOM = np.random.default_rng(1)
 COLUMNS = RANDOM.normal(size=(50, 3)) * [1e-9, 1.0, 1e12]
@@ -48,7 +43,7 @@ def test_a_direction_below_the_tolerance_is_left_out():
 
 
 def test_a_triangle_of_blocks_has_the_products_of_the_columns(monkeypatch):
-    monkeypatch.setattr("omsm_ros.least_squares._ROWS", 7)
+    monkeypatch.setattr("omsm_ros.linear_algebra._ROWS", 7)
     one, other = np.random.default_rng(3).normal(size=(2, 40, 3))
     found = triangle(one, other)
     columns = np.column_stack([one, other])

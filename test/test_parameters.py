@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.parameters import Parameter
-from omsm_ros.quantities import LAG, PERCENT
+from omsm_ros.quantities import LAG, PERCENT, Parameter
 
 LAMP = Parameter("lamp", -1.0, "brightness [%]; -1 = as it is", PERCENT, unset=-1.0)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import linalg, signal
 
-from omsm_ros import scipy_parts
-from omsm_ros.scipy_parts import generalised_eigenvalues, sosfilt
+from omsm_ros import linear_algebra
+from omsm_ros.linear_algebra import generalised_eigenvalues, sosfilt
 
 SECTIONS = signal.butter(6, 0.2, output="sos")
 SAMPLES = np.random.default_rng(1).normal(size=700)
@@ -45,8 +45,8 @@ def test_any_layout_of_samples_will_do(samples: np.ndarray) -> None:
 @pytest.fixture
 def scipy_elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As after a release of scipy that has moved its compiled parts."""
-    cached = (scipy_parts._filter_loop, scipy_parts._pencil_solver)
-    monkeypatch.setattr(scipy_parts, "_loaded", lambda name: None)
+    cached = (linear_algebra._filter_loop, linear_algebra._pencil_solver)
+    monkeypatch.setattr(linear_algebra, "_loaded", lambda name: None)
     for function in cached:
         function.cache_clear()
     yield
@@ -58,7 +58,7 @@ def scipy_elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_where_the_loop_is_not_found_the_public_function_serves() -> None:
     expected, after = public(SAMPLES, np.ones((3, 2)))
     state = np.ones((3, 2))
-    assert scipy_parts._filter_loop() is scipy_parts._public_loop
+    assert linear_algebra._filter_loop() is linear_algebra._public_loop
     assert np.array_equal(sosfilt(SECTIONS, SAMPLES, state), expected)
     assert np.array_equal(state, after)
 
@@ -78,7 +78,7 @@ def test_eigenvalues_are_those_of_scipy_to_the_last_bit() -> None:
 
 @pytest.mark.usefixtures("scipy_elsewhere")
 def test_where_the_solver_is_not_found_the_public_function_serves() -> None:
-    assert scipy_parts._pencil_solver() is scipy_parts._public_solver
+    assert linear_algebra._pencil_solver() is linear_algebra._public_solver
     assert np.array_equal(by_value(generalised_eigenvalues(A, B)), by_value(linalg.eigvals(A, B)))
 
 
@@ -87,14 +87,14 @@ def run(code: str) -> str:
     return done.stdout.strip()
 
 
-LOAD = "from omsm_ros.scipy_parts import _filter_loop, _pencil_solver; "
+LOAD = "from omsm_ros.linear_algebra import _filter_loop, _pencil_solver; "
 LOAD += "_filter_loop(), _pencil_solver()"
 
 
 def test_correcting_loads_neither_ros_nor_the_heavy_parts_of_scipy() -> None:
     heavy = ["scipy.signal", "scipy.linalg", "scipy.stats", "scipy.optimize", "scipy.interpolate"]
     heavy += ["scipy.fft", "rclpy", "omsm_msgs", "matplotlib", "control", "tqdm"]
-    code = f"import sys, omsm_ros.cli.measuring; {LOAD}; "
+    code = f"import sys, omsm_ros.cli.correct; {LOAD}; "
     assert run(code + f"print([m for m in {heavy} if m in sys.modules])") == "[]"
 
 

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 import omsm_ros
+from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
 from omsm_ros.core.identification.covariance_terms import CovarianceTerm
-from omsm_ros.core.identification.finding import Finding
-from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface import nominal
-from omsm_ros.storage.surface_file import load_surface
+from omsm_ros.io.descriptions import load_surface
 
 PACKAGE = Path(omsm_ros.__file__).resolve().parent
 
@@ -176,8 +176,8 @@ def test_a_column_of_the_cloud_is_added_in_core_correction(tmp_path):
 import json, sys
 import numpy as np
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
-from omsm_ros.storage.cloud_file import CloudFile, PlyWriter
-from omsm_ros.storage.conversions import Messages, cloud_array, cloud_message
+from omsm_ros.io.results import CloudFile, PlyWriter
+from omsm_ros.io.message_mapping import Messages, cloud_array, cloud_message
 from types import SimpleNamespace
 names = "x y height dynamic_error uncertainty intensity slope".split()
 made = SurfacePoints(sample=np.arange(3), **{n: np.arange(3.0) for n in names})

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
-from omsm_ros.core.verification.live_offset import LiveOffset
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.counter_offset import LiveOffset
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 N, BLOCK, PERIOD, NOISE = 8000, 50, 1e-3, 10e-9

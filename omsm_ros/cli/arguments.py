@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
+from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.errors import ConfigurationError, FileError, one_line, shortened
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
-from omsm_ros.storage import strict_json
-from omsm_ros.storage.maps.length_units import LengthUnits, units_of
-from omsm_ros.storage.recording.topics import TOPIC_TYPES, AnyBag, CellBag, relative
+from omsm_ros.units import LengthUnits, units_of
 
 _LONGEST_MESSAGE = 480
 TABLE_SUFFIX = ".csv"
@@ -57,7 +57,7 @@ def number(quantity: Quantity) -> Callable[[str], Any]:
 def json_object(text: str) -> dict[str, object]:
     """Return the argument type: a JSON object."""
     try:
-        return strict_json.object_of(text, ConfigurationError, shown(text))
+        return json_and_yaml.object_of(text, ConfigurationError, shown(text))
     except ConfigurationError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from omsm_ros.core.dynamics.calibration import REJECTED
-from omsm_ros.jobs.progress import Progress, no_progress
+from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.errors import printable
+from omsm_ros.pipelines.progress import Progress, no_progress
 
 Facts: TypeAlias = "dict[str, Any]"
 
@@ -61,3 +63,46 @@ def rejected(facts: Facts) -> str:
         return ""
     kept = facts.get("calibration") or facts["model"]
     return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {kept!r}"
+
+
+# Where commands print for people: names and texts in a line may come from outside.
+
+
+def say(*words: str) -> None:
+    """Print one line; what in it would steer a terminal, or end the line, is written out."""
+    print(printable(" ".join(words)))
+
+
+def say_lines(text: str) -> None:
+    """Print a text of ours that has several lines."""
+    for line in text.split("\n"):
+        say(line)
+
+
+def written(files: Iterable[str], folder: str = "") -> tuple[str, str]:
+    """Return the row of a table that says what was written: names and their folder, or paths."""
+    names = ", ".join(files)
+    return "written", f"{names} in {folder}" if folder else names
+
+
+def table(rows: list[tuple[str, str]]) -> None:
+    """Print names and values in two columns; nothing where there are none."""
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        say(f"{name:<{width}}  {value}")
+
+
+# The option that names the catalogue where what was calibrated or measured is written down.
+
+ADDRESS = "OMSM_CATALOGUE"
+"""Environment variable: the catalogue of this shop, where none is named."""
+
+
+def declare_catalogue(sub: argparse.ArgumentParser) -> None:
+    """Add ``--catalogue`` to a command that makes something worth remembering."""
+    sub.add_argument(
+        "--catalogue",
+        default=os.environ.get(ADDRESS, ""),
+        metavar="FILE|URL",
+        help=f"write it down there, too; default: ${ADDRESS}",
+    )

@@ -7,20 +7,22 @@ import errno
 import importlib
 import io
 import os
+import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Collection, Sequence
+import threading
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING
 
 from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
-from omsm_ros.cli.at_work import at_work
-from omsm_ros.cli.ending import AskedToEndError, end_as_asked, interrupted_when_asked
-from omsm_ros.cli.overwriting import check_outputs
-from omsm_ros.cli.printing import say, say_lines, table, written
+from omsm_ros.cli.command import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
     DEBUG,
@@ -29,13 +31,145 @@ from omsm_ros.errors import (
     OmsmError,
     defect,
     one_line,
+    shortened,
     too_many_open_files,
 )
+from omsm_ros.io import json_and_yaml
+from omsm_ros.pipelines.progress import beside, tick
 from omsm_ros.quantities import shown
-from omsm_ros.storage import strict_json
 
-if TYPE_CHECKING:  # it would load what reads bags, for a list of words
+if TYPE_CHECKING:
     from omsm_ros.cli.command import Command, Facts
+
+
+# Seconds on the terminal, where a command works for long and nobody can tell how long.
+
+# What is over before that needs no line.
+_PATIENCE_S = 1.0
+
+
+@contextmanager
+def at_work(title: str, quiet: bool) -> Iterator[None]:
+    """Count the seconds on stderr, with ``title``; silent for programs, in pipes and at first.
+
+    Bars of what can be counted stand below it.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield
+        return
+    with beside(partial(_show, title)):
+        yield
+
+
+def _show(title: str, done: Event) -> None:
+    if done.wait(_PATIENCE_S):
+        return
+    from tqdm import tqdm
+
+    with tqdm(desc=title, bar_format="{desc}: {elapsed} so far", leave=False) as line:
+        line.start_t -= _PATIENCE_S
+        tick(line, done)
+
+
+# A command that is asked to end removes what it has not finished, as it does on Ctrl-C.
+
+# As "kill", "systemctl stop" or a batch system ask, and a terminal that is closed.
+_ASKED = (signal.SIGTERM, signal.SIGHUP)
+
+
+class AskedToEndError(KeyboardInterrupt):
+    """The signal ``number`` came; like Ctrl-C it is no error of what is being done."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextmanager
+def interrupted_when_asked() -> Iterator[None]:
+    """Raise AskedToEndError where a signal would end the process at once; the second one does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+
+    def asked(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        raise AskedToEndError(number)
+
+    # What is ignored stays so, as SIGHUP below nohup.
+    ours = [one for one in _ASKED if signal.getsignal(one) is signal.SIG_DFL]
+    for one in ours:
+        signal.signal(one, asked)
+    try:
+        yield
+    finally:
+        for one in ours:
+            signal.signal(one, signal.SIG_DFL)
+
+
+def end_as_asked(number: int) -> None:
+    """End this process by the signal ``number``, so that who waits for it sees by what it ended."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
+
+
+# May results be written there, or would they take the place of what was measured?
+#
+# A name completed by the shell is easily that of the recording itself. Every command puts its
+# result
+# in the place of an older one, so what is read, and any recording, is looked for before it begins.
+
+_OUTPUTS = ("out", "plot", "report")
+_RECORDINGS = (".mcap", ".db3", ".bag")
+# What a command makes of a file is one of the same kind, which may stand for it.
+_IN_PLACE = {
+    ("latency", "calibration"),
+    ("reversal", "calibration"),
+    ("selfcal", "calibration"),
+    ("align", "geometry"),
+}
+
+
+def check_outputs(args: argparse.Namespace) -> None:
+    """Raise ConfigurationError where an output of a command is what it reads, or a recording."""
+    given = vars(args)
+    read = {
+        name: [*_paths(value)]
+        for name, value in given.items()
+        if name not in (*_OUTPUTS, "command") and (args.command, name) not in _IN_PLACE
+    }
+    for output in _OUTPUTS:
+        written = given.get(output)
+        if not isinstance(written, Path) or not os.path.lexists(written):
+            continue
+        what = f"--{output} {shortened(repr(str(written)), 200)}"
+        if any(_same(written, path) for paths in read.values() for path in paths):
+            raise ConfigurationError(
+                f"{what} is what is read, and would be lost; give another name"
+            )
+        # Who writes recordings takes the place of none, and says so.
+        taken = args.command != "import" and written.is_file()
+        if taken and written.suffix.lower() in _RECORDINGS:
+            raise ConfigurationError(f"{what} is a recording, and would be lost; give another name")
+
+
+def _paths(value: object) -> Iterator[Path]:
+    """Yield the paths in what an argument was taken for."""
+    if isinstance(value, list | tuple):
+        for one in value:
+            yield from _paths(one)
+    elif isinstance(value, str | Path) and value != "":
+        yield Path(value)
+
+
+def _same(written: Path, path: Path) -> bool:
+    """Return whether both are one file, or one folder that is a bag."""
+    try:
+        alike = os.path.samefile(written, path)
+    except (OSError, ValueError):
+        return False
+    return alike and (written.is_file() or (written / "metadata.yaml").is_file())
+
 
 DONE, BAD_INPUT, DEFECT = 0, 2, 70  # 70 is EX_SOFTWARE of sysexits.h
 
@@ -131,11 +265,11 @@ def _declare_demo(sub: argparse.ArgumentParser) -> None:
 
 
 def _experiment(args: argparse.Namespace) -> int:
-    from omsm_ros.jobs.paper_experiments import run_experiment
+    from omsm_ros.pipelines.paper_experiments import run_experiment
 
     facts = run_experiment(args.experiment, args.out, args.seed)
     if args.json:
-        print(strict_json.text_of(strict_json.unknown_as_null(facts)), flush=True)
+        print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)), flush=True)
         return DONE
     for row in facts["compared"]:
         say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
@@ -247,7 +381,7 @@ def _run(args: argparse.Namespace) -> int:
 def _tell(args: argparse.Namespace, facts: Facts) -> None:
     try:
         if args.json:
-            print(strict_json.text_of(strict_json.unknown_as_null(facts)))
+            print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)))
         else:
             args.run.show(facts)
         sys.stdout.flush()

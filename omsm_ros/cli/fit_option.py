@@ -7,11 +7,11 @@ import argparse
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Facts
-from omsm_ros.core.registration.freedoms import parsed_freedoms
+from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import count, measured
-from omsm_ros.report.measurement.part import dragged, figure_rows, settled
+from omsm_ros.report.measurement.page import dragged, figure_rows, settled
 
 
 def freedoms(text: str) -> tuple[str, ...]:

@@ -9,11 +9,11 @@ from typing import Any
 from omsm_msgs.msg import AccelerationBlock
 from rclpy.publisher import Publisher
 
-from omsm_ros.devices.sensor_factory import ACCELEROMETER_PARAMETERS, make_accelerometer
-from omsm_ros.nodes.driving import DriverNode
+from omsm_ros.instruments.factory import ACCELEROMETER_PARAMETERS, make_accelerometer
+from omsm_ros.io import message_mapping
+from omsm_ros.nodes.driver import DriverNode
 from omsm_ros.nodes.running import run
-from omsm_ros.parameters import Parameter
-from omsm_ros.storage import conversions
+from omsm_ros.quantities import Parameter
 
 TOPIC = "acceleration"
 
@@ -38,7 +38,7 @@ class AccelerometerDriverNode(DriverNode):
             return
         frame = self.values["accelerometer_frame"]
         for block in blocks:
-            message = conversions.acceleration_message(self._messages, block, frame)
+            message = message_mapping.acceleration_message(self._messages, block, frame)
             self._acceleration.publish(message)
 
     def _both(self) -> list[tuple[str, Publisher]]:

@@ -14,10 +14,10 @@ from typing import Any
 from omsm_msgs.msg import Calibration as CalibrationMessage
 from rclpy.node import Node
 
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import OmsmError, one_line
+from omsm_ros.io import message_mapping
 from omsm_ros.nodes import topics
-from omsm_ros.storage import conversions
 
 TOPIC = "calibration"
 _COMPLAINT_PERIOD_S = 5.0
@@ -43,7 +43,7 @@ class CalibrationTopic:
         self.refused = ""
         self._node, self._take = node, take
         self._repeated_ns = 0
-        self._messages = conversions.ros_messages()
+        self._messages = message_mapping.ros_messages()
         # Both are made without a check for rivals: here more than one may speak.
         self._publisher = topics.publish_on(
             node, undo, CalibrationMessage, TOPIC, topics.LATCHED_QOS
@@ -60,11 +60,11 @@ class CalibrationTopic:
     def announce(self, calibration: Calibration, since_ns: int) -> None:
         """Say that ``calibration`` is in force since ``since_ns`` [ns]."""
         self.calibration, self.since_ns, self.refused = calibration, since_ns, ""
-        message = conversions.calibration_message(self._messages, calibration, since_ns)
+        message = message_mapping.calibration_message(self._messages, calibration, since_ns)
         self._publisher.publish(message)
 
     def _on_message(self, message: Any, _: topics.MessageInfo) -> None:
-        since_ns = self._plausible(conversions.stamp_of(message))
+        since_ns = self._plausible(message_mapping.stamp_of(message))
         known = self.calibration
         if known is not None and since_ns <= self.since_ns:
             return
@@ -72,7 +72,7 @@ class CalibrationTopic:
             self.announce(known, since_ns)
             return
         try:
-            heard = conversions.calibration(message)
+            heard = message_mapping.calibration(message)
             self._take(heard, since_ns)
         except OmsmError as err:
             self.refused = one_line(err)

@@ -13,29 +13,22 @@ from omsm_msgs.srv import Identify
 from std_msgs.msg import String
 
 from omsm_ros import quantities
-from omsm_ros.core.dynamics.calibration import (
-    REJECTED,
-    Calibration,
-    settings_with,
-    verdict_of,
-)
-from omsm_ros.core.samples.motion_buffer import BlockBuffer
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
-from omsm_ros.core.samples.recent import RecentIncrease
-from omsm_ros.core.samples.stamped_period import check_period
+from omsm_ros.core.calibration.calibration import REJECTED, Calibration, settings_with, verdict_of
+from omsm_ros.core.streams.motion_record import BlockBuffer, MotionRecord, assemble
+from omsm_ros.core.streams.stamps import RecentIncrease, check_period
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
-from omsm_ros.jobs.remember import remembered
-from omsm_ros.nodes.aside import Aside
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import CalibrationFolder
+from omsm_ros.io.folders import claimed
+from omsm_ros.nodes.background_worker import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
-from omsm_ros.parameters import Parameter
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_folder import CalibrationFolder
-from omsm_ros.storage.claim import claimed
+from omsm_ros.pipelines.history import remembered
+from omsm_ros.quantities import Parameter
 
 # What identifies takes seconds to load on a small computer, and samples are kept without it: each
 # piece of work loads its own, beside them.
@@ -60,7 +53,7 @@ class CalibratorNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("calibrator", PARAMETERS)
-        self._messages = conversions.ros_messages()
+        self._messages = message_mapping.ros_messages()
 
     def configure(self, undo: ExitStack) -> None:
         """Take up what was in force, and answer requests."""
@@ -89,7 +82,7 @@ class CalibratorNode(ManagedNode):
             listen(self, undo, kind, topic, partial(self._keep, topic))
 
     def _keep(self, topic: str, message: AxisBlock | DistanceBlock, _: MessageInfo) -> None:
-        convert = conversions.axis_block if topic == "axes" else conversions.distance_block
+        convert = message_mapping.axis_block if topic == "axes" else message_mapping.distance_block
         try:
             self._buffers[topic].add(convert(message))
         except OmsmError as err:
@@ -98,7 +91,7 @@ class CalibratorNode(ManagedNode):
 
     def _on_probe(self, message: String, _: MessageInfo) -> None:
         try:
-            reported = conversions.probe_settings(message)
+            reported = message_mapping.probe_settings(message)
         except OmsmError as err:
             self.get_logger().error(f"probe settings refused: {err}", throttle_duration_sec=5.0)
             return
@@ -152,7 +145,7 @@ class CalibratorNode(ManagedNode):
             identified = await self._aside.do(self._work(request))
             calibration = identified.calibration
             since_ns = self._topic.decided()
-            response.calibration = conversions.calibration_message(
+            response.calibration = message_mapping.calibration_message(
                 self._messages, calibration, since_ns
             )
             response.success, self._last = self._judge(calibration, since_ns)
@@ -181,7 +174,7 @@ class CalibratorNode(ManagedNode):
     def _noted(self, bag: str, calibration: Calibration) -> str:
         """Write it into the catalogue and say so; a database that fails undoes no calibration."""
         # The database's library is an optional package.
-        from omsm_ros.jobs.keep_history import keep_calibration
+        from omsm_ros.pipelines.history import keep_calibration
 
         source = Path(bag) if bag else None
         warnings = remembered(
@@ -193,7 +186,7 @@ class CalibratorNode(ManagedNode):
     def _certified(self, bag: str, identified: Identification) -> str:
         """Write the certificate and say so; a full disk does not undo a calibration."""
         # Drawing takes a second to import; most calibrators do without.
-        from omsm_ros.jobs.certify import write_certificate
+        from omsm_ros.pipelines.identify import write_certificate
 
         folder = Path(self.values["report"])
         try:
@@ -221,7 +214,7 @@ class CalibratorNode(ManagedNode):
         return lambda: _identified(motion(), order=order, input=source, **told())
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
-        from omsm_ros.jobs.identify_bag import motion_of_bag
+        from omsm_ros.pipelines.identify import motion_of_bag
 
         return motion_of_bag(
             bag, duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
@@ -264,7 +257,7 @@ def _identified(*motion: Any, **options: Any) -> Identification:
 
 
 def _told_by_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
-    from omsm_ros.jobs.identify_bag import recorded_ns_of_bag, settings_of_bag
+    from omsm_ros.pipelines.identify import recorded_ns_of_bag, settings_of_bag
 
     return {"settings": settings_of_bag(bag, stated), "recorded_ns": recorded_ns_of_bag(bag)}
 

@@ -13,22 +13,26 @@ from rclpy.clock import Clock, ClockType
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
-from omsm_ros.emulators.acceleration import AccelerationFeed
-from omsm_ros.emulators.generic_stream import Faults
-from omsm_ros.emulators.instrument import Line
-from omsm_ros.emulators.players import EMULATED, emulated, line_for, player_for
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.instruments.emulator import Line
+from omsm_ros.instruments.emulator_factory import (
+    EMULATED,
+    AccelerationFeed,
+    emulated,
+    line_for,
+    player_for,
+)
+from omsm_ros.instruments.six_channel.emulator import Faults
+from omsm_ros.io import message_mapping
+from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.folders import claimed, runtime_folder
 from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
-from omsm_ros.parameters import Parameter
-from omsm_ros.storage import conversions
-from omsm_ros.storage.claim import claimed
-from omsm_ros.storage.disturbance_file import load_disturbances
-from omsm_ros.storage.runtime_folder import runtime_folder
-from omsm_ros.twin.channels import ReferenceSensor
+from omsm_ros.quantities import Parameter
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
+from omsm_ros.twin.sensors import ReferenceSensor
 
 _SCENARIO = (
     Parameter("seed", 1, "seed of all noise", quantities.SEED),
@@ -98,7 +102,7 @@ class CellEmulatorNode(ManagedNode):
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
-        self._messages = conversions.ros_messages()
+        self._messages = message_mapping.ros_messages()
         self._felt = self.publish_on(undo, AccelerationBlock, "acceleration")
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
@@ -126,7 +130,7 @@ class CellEmulatorNode(ManagedNode):
     def _publish_felt(self) -> None:
         block = self._feed.due(self._player.played) if self._feed else None
         if block is not None:
-            self._felt.publish(conversions.acceleration_message(self._messages, block))
+            self._felt.publish(message_mapping.acceleration_message(self._messages, block))
 
     def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
         if not self.active:

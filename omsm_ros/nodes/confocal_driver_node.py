@@ -7,10 +7,10 @@ from functools import partial
 
 from std_srvs.srv import Trigger
 
-from omsm_ros.devices.factory import PARAMETERS, make_device
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.nodes.aside import Aside
-from omsm_ros.nodes.driving import DriverNode
+from omsm_ros.instruments.factory import PARAMETERS, make_device
+from omsm_ros.nodes.background_worker import Aside
+from omsm_ros.nodes.driver import DriverNode
 from omsm_ros.nodes.running import run
 
 # A dark reference takes some three seconds; more if the device is slow to answer.

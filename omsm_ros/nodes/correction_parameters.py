@@ -14,11 +14,10 @@ from omsm_ros.core.correction.machine_sources import (
     declared_sources,
 )
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.parameters import Parameter
-from omsm_ros.quantities import Quantity
-from omsm_ros.storage.sources_file import load_sources
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
+from omsm_ros.io.descriptions import load_sources
+from omsm_ros.quantities import Parameter, Quantity
 
 _AS_CALIBRATED = _NOT_ASKED = -1.0
 _GEOMETRY_OF = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}

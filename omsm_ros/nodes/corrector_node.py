@@ -3,39 +3,232 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import LoadCalibration, PredictError
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 
-from omsm_ros.core.correction.applicability import admit, objections
+from omsm_ros.core.calibration.applicability import admit, objections
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.budget import Light
 from omsm_ros.core.correction.correct import Corrector
+from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.merging import consecutive
-from omsm_ros.core.verification.live_offset import LiveOffset
+from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
+from omsm_ros.core.streams.blocks import consecutive
+from omsm_ros.core.streams.continuity import LoadMeter
+from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.trigger_slips import Slip
 from omsm_ros.errors import OmsmError
-from omsm_ros.jobs.judge_scan import live_light, with_sources
-from omsm_ros.nodes.aside import Aside
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import confined, load_calibration, load_for_others, since
+from omsm_ros.io.descriptions import load_surface
+from omsm_ros.nodes import topics
+from omsm_ros.nodes.background_worker import Aside
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
-from omsm_ros.nodes.correction_state import PAUSE_S, CorrectionState, light_values
-from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
-from omsm_ros.nodes.frames import tell_frames
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import load_calibration, load_for_others
-from omsm_ros.storage.calibration_folder import confined, since
-from omsm_ros.storage.surface_file import load_surface
+from omsm_ros.pipelines.measure import live_light, with_sources
+
+# What the corrector says of itself: starved, refusing, losing, behind, or correcting.
+
+# Without a block for so long, and for as long as several last, the motion has paused [s].
+PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
+_STREAMS_CORRECTION_STATE = ("axes", "distance")
+# Longer than the pauses within a step test; five samples of a slow device.
+_SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
+# Of the two seconds of small blocks that wait at most, half.
+_BEHIND_MS = 1000.0
+# Reasons that are a sign of something lost on the way, unlike a probe that looks past its target.
+_LOSSES = ("unmatched", "late", "overdue")
+
+
+def light_values(light: Light) -> dict[str, object]:
+    """Return the light as values of a report: no fault of the node's, so no level of it."""
+    return {
+        "light": light.level,
+        "light_word": light.word,
+        "light_reasons": "; ".join(map(str, light.reasons)),
+    }
+
+
+class CorrectionState:
+    """Counts what the core never sees, and weighs both."""
+
+    def __init__(self) -> None:
+        self.uncalibrated = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
+        self.refused = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
+        self.refusal = ""
+        self.published = 0
+        self.load = LoadMeter()
+        self.begins_at: dict[str, int] = {}
+        self._heard = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
+        self._period = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0.0)
+        self._flows = {stream: Flow() for stream in _STREAMS_CORRECTION_STATE}
+        self._recent = RecentIncrease()
+        self._oldest_ns = 0
+        self._resumes = 0.0
+
+    def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
+        """Note a block, whatever becomes of it; first: its trigger number;  now: [s]."""
+        self._resumes = now + max(PAUSE_S, _PAUSE_BLOCKS * samples * period)
+        self.begins_at.setdefault(stream, first)
+        self._heard[stream] += samples
+        self._period[stream] = period
+
+    def pauses(self, now: float) -> bool:
+        """Return whether no block came for as long as none does only where the motion ended [s]."""
+        return now > self._resumes
+
+    def arrived(self, stamp_ns: int) -> None:
+        """Note that a message arrived at ``stamp_ns`` [ns], of those now taken."""
+        self._oldest_ns = min(self._oldest_ns or stamp_ns, stamp_ns)
+
+    def done(self, now_ns: int) -> None:
+        """Note that all that arrived has been dealt with [ns]."""
+        if self._oldest_ns:
+            self.load.block(self._oldest_ns, now_ns)
+        self._oldest_ns = 0
+
+    def report(
+        self,
+        corrector: Corrector | None,
+        now: float,
+        cpu: float,
+        motion: LiveOffset | None = None,
+    ) -> Report:
+        """Weigh the state; ``corrector`` is None without a calibration.
+
+        motion: what it says of the counters of two devices
+        """
+        report = Report("correcting", {"clouds_published": self.published})
+        for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
+            report.values |= {
+                f"{stream}_{name}": counts[stream] for stream in _STREAMS_CORRECTION_STATE
+            }
+        report.values |= {f"begins_at_{name}": first for name, first in self.begins_at.items()}
+        self._add_starved(report, now)
+        if corrector is None:
+            report.add(WARN, "no calibration: nothing is published")
+            return report
+        report.values |= self.load.report(cpu, now)
+        report.values["stamp_skew_s"] = corrector.stamp_skew
+        slip = corrector.slips.state
+        report.values |= {"slip_samples": slip.samples, "slip_seen_from_samples": slip.seen_from}
+        report.values["pairs_held"] = corrector.held
+        if slip.samples:
+            report.add(ERROR, f"not corrected: {slip}")
+        if motion is not None:
+            _add_motion(report, slip, motion)
+        report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}
+        self._add_losses(report, self._account(report, corrector), now)
+        waited = self.load.worst_ms()
+        if waited > _BEHIND_MS:
+            report.add(WARN, f"falls behind: samples waited {waited / 1000:.1f} s")
+        return report
+
+    def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
+        """Enter every count of the account; return those that may mean trouble."""
+        watched: dict[str, float] = {}
+        for stream, account in corrector.account.as_dict().items():
+            counts: dict[str, int] = {**account}  # type: ignore[dict-item]
+            counted: dict[str, int] = counts.pop("counted")  # type: ignore[assignment]
+            missing = counts.pop("missing")
+            report.values[f"missing_{stream}"] = watched[f"{stream} missing"] = missing
+            for name, value in (counts | counted).items():
+                report.values[f"{stream}_{name}"] = value
+                if name in _LOSSES:
+                    watched[f"{stream} {name}"] = value
+            watched[f"{stream} refused"] = self.refused[stream]
+            watched[f"{stream} received"] = counts["received"]
+        return watched
+
+    def _add_losses(self, report: Report, watched: dict[str, float], now: float) -> None:
+        rises = self._recent.update(watched, now)
+        for stream in _STREAMS_CORRECTION_STATE:
+            received = rises.pop(f"{stream} received", 0)
+            refused = rises.pop(f"{stream} refused", 0)
+            if refused and not received:
+                report.add(ERROR, f"every block of {stream} is refused: {self.refusal}")
+            elif refused:
+                report.add(WARN, f"just now: {refused:.0f} samples of {stream} refused")
+        if rises:
+            text = ", ".join(f"{name} {rise:.0f}" for name, rise in rises.items())
+            report.add(WARN, f"just now: {text}")
+
+    def _add_starved(self, report: Report, now: float) -> None:
+        for stream, flow in self._flows.items():
+            flow.update(self._heard[stream], now)
+            report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
+            silent = flow.silent(now)
+            patience = max(_SILENCE_S, _SILENCE_SAMPLES * self._period[stream])
+            if silent is None:
+                report.add(STALE, f"no sample of {stream} yet")
+            elif silent > patience:
+                report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
+
+
+def _add_motion(report: Report, slip: Slip, motion: LiveOffset) -> None:
+    """Enter what a motion before a fixed target said of the counts, and hold the stamps to it."""
+    told = motion.established
+    report.values["motion_offset_samples"] = None if told is None else told.samples
+    if told is None:
+        return
+    if told.samples:
+        report.add(
+            ERROR,
+            f"the motion says that the counts are {told.samples} samples apart (± "
+            f"{told.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
+            f"counter_offset {motion.in_use + told.samples}, or identify anew if the lag changed",
+        )
+    elif slip.samples:
+        report.add(ERROR, "but the motion says that equal counts are one trigger: a link is late")
+
+
+# Where the frames stand to each other with every axis at zero, on ``/tf_static``.
+#
+# The machine's frame has its origin where the probe finds a surface at distance zero. The probe
+# stands there and looks along its beam; the workpiece's origin lies on the spindle's axis.
+
+
+def tell_frames(node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]) -> None:
+    """Publish machine → probe and machine → workpiece, latched.
+
+    names: of the frames, machine_frame, probe_frame, workpiece_frame
+    """
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:  # it is in every distribution, not in the wheels
+        node.get_logger().info("tf2_msgs is not installed: no transforms are published")
+        return
+    header = Header(stamp=node.get_clock().now().to_msg(), frame_id=names["machine_frame"])
+    x, y, z, w = beam_quaternion(geometry)
+    probe = Transform(rotation=Quaternion(x=x, y=y, z=z, w=w))
+    centre = Vector3(x=geometry.centre_x, y=geometry.centre_y)
+    placed = {"probe_frame": probe, "workpiece_frame": Transform(translation=centre)}
+    publisher = topics.publish_on(node, undo, TFMessage, "/tf_static", topics.LATCHED_QOS)
+    publisher.publish(
+        TFMessage(
+            transforms=[
+                TransformStamped(header=header, child_frame_id=names[name], transform=transform)
+                for name, transform in placed.items()
+            ]
+        )
+    )
+
 
 _STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 _COMPLAINT_PERIOD_S = 5.0
@@ -47,7 +240,7 @@ class CorrectorNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("corrector", PARAMETERS)
-        self._messages = conversions.ros_messages()
+        self._messages = message_mapping.ros_messages()
 
     def configure(self, undo: ExitStack) -> None:
         """Take up the calibration to start with, and answer requests."""
@@ -120,7 +313,7 @@ class CorrectorNode(ManagedNode):
     def _on_probe(self, message: String, _: MessageInfo) -> None:
         """Stop correcting where the calibration belongs to a probe set otherwise; else begin."""
         try:
-            reported = conversions.probe_settings(message)
+            reported = message_mapping.probe_settings(message)
         except OmsmError as err:
             self._complain(f"probe settings refused: {err}")
             return
@@ -190,7 +383,7 @@ class CorrectorNode(ManagedNode):
                 or "samples come, but there is no calibration: call identify or load one"
             )
             return
-        convert = conversions.axis_block if stream == "axes" else conversions.distance_block
+        convert = message_mapping.axis_block if stream == "axes" else message_mapping.distance_block
         try:
             block = convert(message)
             self._waiting[stream].append(block)
@@ -228,7 +421,7 @@ class CorrectorNode(ManagedNode):
     def _publish(self, points: SurfacePoints | None) -> None:
         if points is None:
             return
-        cloud = conversions.cloud_message(
+        cloud = message_mapping.cloud_message(
             self._messages, pack_points(points), points.stamp_ns, self._frame
         )
         self._points.publish(cloud)
@@ -263,7 +456,7 @@ class CorrectorNode(ManagedNode):
 
 def _prediction(*motion: Any) -> Prediction:
     # What reads bags takes as long to load as all else; most correctors are never asked.
-    from omsm_ros.jobs.predict_motion import predict_from
+    from omsm_ros.pipelines.verify_calibration import predict_from
 
     return predict_from(*motion)
 

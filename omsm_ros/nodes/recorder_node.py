@@ -15,13 +15,13 @@ from sensor_msgs.msg import PointCloud2, Temperature
 from std_msgs.msg import String
 
 from omsm_ros.errors import BagError, ConfigurationError
+from omsm_ros.io import topics
+from omsm_ros.io.bag_writer import BagWriter, next_free
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_waiting
-from omsm_ros.parameters import Parameter
-from omsm_ros.storage.recording import topics
-from omsm_ros.storage.recording.bag_writer import BagWriter, next_free
+from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
     Parameter("path", "", "the .mcap file to write; it must not exist yet", required=True),

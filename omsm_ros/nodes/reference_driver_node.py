@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from omsm_ros.devices.sensor_factory import REFERENCE_PARAMETERS, make_reference
-from omsm_ros.nodes.driving import DriverNode
+from omsm_ros.instruments.factory import REFERENCE_PARAMETERS, make_reference
+from omsm_ros.nodes.driver import DriverNode
 from omsm_ros.nodes.running import run
 
 

@@ -33,13 +33,13 @@ from omsm_ros.errors import (
     one_line,
     too_many_open_files,
 )
+from omsm_ros.io import json_and_yaml
 from omsm_ros.loading import nothing_to_undo
 from omsm_ros.nodes.diagnostics import survive
 from omsm_ros.nodes.managed import ManagedNode, Stage
 from omsm_ros.nodes.memory import keep_for_good
 from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
-from omsm_ros.storage import strict_json, strict_yaml
 
 _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
 # A node that has not ended so long after it was asked to ends at the next signal, as it stands.
@@ -95,7 +95,7 @@ def _init() -> None:
 def _check_parameter_file(path: Path) -> None:
     """Refuse what rcl passes over: a text that is one single value, or none at all."""
     # A pipe has been read by now.
-    if path.is_file() and not strict_yaml.begins_as_mapping(path.read_bytes()):
+    if path.is_file() and not json_and_yaml.begins_as_mapping(path.read_bytes()):
         raise ConfigurationError(
             f"{str(path)!r} is no file of parameters: it must begin with the name of a node, or "
             "/**, and has ros__parameters below"
@@ -177,7 +177,7 @@ def _spin(node: ManagedNode, ending: _Ending) -> None:
 
 def settings_of(text: str) -> dict[str, object]:
     """Return settings from a JSON object, or an empty text; else ConfigurationError."""
-    return strict_json.object_of(text or "{}", ConfigurationError, "parameter 'settings'")
+    return json_and_yaml.object_of(text or "{}", ConfigurationError, "parameter 'settings'")
 
 
 class Paced(ReentrantCallbackGroup):  # type: ignore[misc]

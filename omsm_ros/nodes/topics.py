@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.storage import strict_json
+from omsm_ros.io import json_and_yaml
 
 MessageInfo: TypeAlias = "dict[str, int]"
 
@@ -125,7 +125,7 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
 
 def tell_taken(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
     """Answer how many messages of each topic this process has dealt with."""
-    response.success, response.message = True, strict_json.text_of(dict(_taken))
+    response.success, response.message = True, json_and_yaml.text_of(dict(_taken))
     return response
 
 

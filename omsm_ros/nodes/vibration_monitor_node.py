@@ -10,9 +10,8 @@ from omsm_msgs.msg import AccelerationBlock
 from std_msgs.msg import String
 
 from omsm_ros import quantities
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.recent import Flow, RecentIncrease
-from omsm_ros.core.spectra.running_spectrum import (
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.ripple.accelerometer import (
     AXES,
     CARRIAGE,
     PROBE,
@@ -20,16 +19,17 @@ from omsm_ros.core.spectra.running_spectrum import (
     MonitorOptions,
     RunningSpectrum,
 )
+from omsm_ros.core.streams.stamps import Flow, RecentIncrease
 from omsm_ros.errors import ConfigurationError, OmsmError
+from omsm_ros.io import json_and_yaml, message_mapping
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.diagnostics import STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import MessageInfo, listen, publish_on
-from omsm_ros.parameters import Parameter
+from omsm_ros.quantities import Parameter
 from omsm_ros.readable import quantity
-from omsm_ros.storage import conversions, strict_json
-from omsm_ros.storage.calibration_file import load_calibration
 
 _SILENCE_S, _SILENCE_BLOCKS = 2.0, 5
 
@@ -86,7 +86,7 @@ class VibrationMonitorNode(ManagedNode):
 
     def _take(self, message: Any, _: MessageInfo) -> None:
         try:
-            block = conversions.acceleration_block(message)
+            block = message_mapping.acceleration_block(message)
             self._running.push(block)
         except OmsmError as err:
             self._refused = str(err)
@@ -102,7 +102,7 @@ class VibrationMonitorNode(ManagedNode):
         if levels is not None and levels.windows != self._told:
             self._told = levels.windows
             told = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
-            self._publisher.publish(String(data=strict_json.text_of(told)))
+            self._publisher.publish(String(data=json_and_yaml.text_of(told)))
 
     def _levels(self) -> Any:
         known = self._calibration

@@ -12,16 +12,15 @@ from sensor_msgs.msg import PointCloud2
 
 from omsm_ros import quantities
 from omsm_ros.errors import OmsmError
+from omsm_ros.io import message_mapping
+from omsm_ros.io.descriptions import load_surface
+from omsm_ros.live_page.live_view import LiveView
+from omsm_ros.live_page.server import LiveServer, render
 from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, MessageInfo, listen
-from omsm_ros.parameters import Parameter
-from omsm_ros.report.live.page import render
-from omsm_ros.storage import conversions
-from omsm_ros.storage.surface_file import load_surface
-from omsm_ros.viewing.live_view import LiveView
-from omsm_ros.viewing.server import LiveServer
+from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
     Parameter("host", "127.0.0.1", "to listen on; another than loopback needs a token"),
@@ -74,19 +73,19 @@ class ViewerNode(ManagedNode):
 
     def _on_points(self, message: Any, info: MessageInfo) -> None:
         try:
-            self._view.add_points(conversions.cloud_array(message))
+            self._view.add_points(message_mapping.cloud_array(message))
         except OmsmError as err:
             self._complain(str(err))
 
     def _on_acceleration(self, message: Any, info: MessageInfo) -> None:
         try:
-            self._view.add_acceleration(conversions.acceleration_block(message))
+            self._view.add_acceleration(message_mapping.acceleration_block(message))
         except OmsmError as err:
             self._complain(str(err))
 
     def _on_calibration(self, message: Any, info: MessageInfo) -> None:
         try:
-            self._view.set_calibration(conversions.calibration(message))
+            self._view.set_calibration(message_mapping.calibration(message))
         except OmsmError as err:
             self._complain(str(err))
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.channels import Accelerometer, ReferenceSensor
-from omsm_ros.twin.clocks import ClockErrors
-from omsm_ros.twin.encoder import EncoderErrors
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.probe import ProbeErrors
+from omsm_ros.twin.sensors import Accelerometer, ClockErrors, EncoderErrors, ReferenceSensor
 from omsm_ros.twin.structure import StructureErrors
 from omsm_ros.twin.vibration import VibrationLine
 

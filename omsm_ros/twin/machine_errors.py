@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.machine.trajectories import AxisPositions
-from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.twin.part_pose import PartPose
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.kinematics.trajectories import AxisPositions
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.record_checks import check_numbers
 from omsm_ros.twin.trajectory import Trajectory
 

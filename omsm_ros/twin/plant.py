@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, signal
 
-from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.machine.trajectories import Motion
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.kinematics.trajectories import Motion
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.trajectory import Trajectory
 

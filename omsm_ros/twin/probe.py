@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import DistanceBlock, FloatArray, Status
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
 from omsm_ros.twin.record_checks import LONGEST_LAG_S, check_numbers

@@ -6,18 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.machine.step_plan import (
+from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
     SECOND_SHARE,
+    Motion,
+    Spiral,
+    StepTest,
     plan_steps,
 )
-from omsm_ros.core.machine.trajectories import Motion, Spiral, StepTest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
-from omsm_ros.twin.figure_error import FigureError
-from omsm_ros.twin.part_pose import PartPose
+from omsm_ros.twin.part import FigureError, PartPose
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 
 # An instant this close to the grid, in steps, is on it: what rounding leaves of k · period.

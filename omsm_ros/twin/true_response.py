@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.probe import Probe
 

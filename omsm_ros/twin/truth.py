@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Recording
 

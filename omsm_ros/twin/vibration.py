@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.record_checks import check_numbers
 

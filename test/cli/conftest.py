@@ -2,7 +2,7 @@
 
 import pytest
 
-from omsm_ros.storage import calibration_file
+from omsm_ros.io import calibration_file
 
 
 @pytest.fixture(scope="module")

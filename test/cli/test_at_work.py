@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from omsm_ros import seconds
-from omsm_ros.cli import at_work as module
-from omsm_ros.cli.at_work import at_work
+from omsm_ros.cli import command_line as module
+from omsm_ros.cli.command_line import at_work
+from omsm_ros.pipelines import progress
 
 LINE = "omsm form: 00:00 so far"
 
@@ -33,7 +33,7 @@ def terminal(monkeypatch):
     def made(patience=0.02):
         monkeypatch.setattr(sys, "stderr", Terminal())
         monkeypatch.setattr(module, "_PATIENCE_S", patience)
-        monkeypatch.setattr(seconds, "_TICK_S", 0.01)
+        monkeypatch.setattr(progress, "_TICK_S", 0.01)
         return sys.stderr
 
     return made

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.trajectories import Chirp
+from omsm_ros.core.kinematics.trajectories import Chirp
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import Flat
-from omsm_ros.storage import bags, calibration_file
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags, calibration_file
+from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import Cell, blocks_of, record
 
 from .written import facts, write

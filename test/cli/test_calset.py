@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.storage.bags import AXES_TOPIC, DISTANCE_TOPIC
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.bags import AXES_TOPIC, DISTANCE_TOPIC
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.cell import blocks_of
 
 SOURCES = """\

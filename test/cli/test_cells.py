@@ -9,9 +9,9 @@ import pytest
 from omsm_ros import cli
 from omsm_ros.cli.command_line import parser_of
 from omsm_ros.cli.words import WORDS
-from omsm_ros.storage import bags
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 

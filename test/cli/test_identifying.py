@@ -8,9 +8,9 @@ import pytest
 from scipy import signal
 
 from omsm_ros import cli
-from omsm_ros.storage import bags
-from omsm_ros.storage.calibration_file import load_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.twin.cell import blocks_of
 
 B, A = np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5])

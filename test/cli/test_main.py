@@ -8,8 +8,8 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli.words import WORDS
-from omsm_ros.storage import bags, calibration_file, cloud_file
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags, calibration_file, results
+from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 
@@ -63,7 +63,7 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     for account in summary["samples"].values():
         assert account["received"] == 40_000
         assert account["corrected"] + sum(account["counted"].values()) == 40_000
-    cloud = cloud_file.CloudFile(tmp_path / "cloud.ply").read()
+    cloud = results.CloudFile(tmp_path / "cloud.ply").read()
     assert len(cloud) == summary["samples"]["distance"]["corrected"]
     # The figure error of the twin's mirror is a few nanometres here, the probe's noise 10 nm.
     assert summary["deviation"]["corrected"]["rms"] < 15e-9
@@ -209,7 +209,7 @@ def test_every_word_is_where_main_looks_for_it():
         assert {c.name for c in made} == {n for n, word in WORDS.items() if word.module == module}
 
 
-@pytest.mark.parametrize(("word", "modules"), [("--help", set()), ("export", {"exporting"})])
+@pytest.mark.parametrize(("word", "modules"), [("--help", set()), ("export", {"export"})])
 def test_only_what_is_asked_for_is_loaded(word, modules):
     block = (
         "import json, sys\n"
@@ -228,9 +228,7 @@ def test_only_what_is_asked_for_is_loaded(word, modules):
         assert not loaded & {"scipy", "rosbags", "matplotlib"}
 
 
-@pytest.mark.parametrize(
-    "loading", ["omsm_ros.cli.command_line", "omsm_ros.cli.inspecting", "numpy"]
-)
+@pytest.mark.parametrize("loading", ["omsm_ros.cli.command_line", "omsm_ros.cli.inspect", "numpy"])
 def test_ctrl_c_while_a_command_loads_is_one_line(loading):
     block = (
         "import os, signal, sys\n"
@@ -314,12 +312,12 @@ def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_p
 
 
 def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypatch, folder):
-    from omsm_ros.cli import inspecting
+    from omsm_ros.cli import inspect
 
     def broken(*_):
         raise AttributeError("'NoneType' object has no\nattribute 'z'")
 
-    monkeypatch.setattr(inspecting, "inspect_bag", broken)
+    monkeypatch.setattr(inspect, "inspect_bag", broken)
     status, out, err = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert (status, out) == (70, "")
     assert err.count("\n") == 1
@@ -331,10 +329,10 @@ def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypat
 
 
 def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
-    from omsm_ros.cli import inspecting
+    from omsm_ros.cli import inspect
 
     told = {"topics": [{"a": float("nan"), "b": [float("inf")]}], "faults": []}
-    monkeypatch.setattr(inspecting.Inspection, "entry", lambda _: told)
+    monkeypatch.setattr(inspect.Inspection, "entry", lambda _: told)
     status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0
     assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.storage import bags, cloud_file
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags, results
+from omsm_ros.io.bag_writer import BagWriter
 
 MIRROR = "shape: off_axis_paraboloid\nparent_focal_length: 25.4e-3\noff_axis_distance: 50.8e-3\n"
 POLARITY_MIRRORED, SLIP, LATE_S = -1, 37, 3e-3
@@ -42,7 +42,7 @@ def corrected(capsys, tmp_path, folder, calibration):
         said = capsys.readouterr()
         if status:
             return said.err
-        return json.loads(said.out), cloud_file.CloudFile(out / "cloud.ply").read()
+        return json.loads(said.out), results.CloudFile(out / "cloud.ply").read()
 
     return correct
 
@@ -165,15 +165,15 @@ def test_an_aperture_limits_what_is_fitted_and_a_tolerance_judges_it(corrected, 
 def test_what_is_known_of_the_geometry_is_kept_by_align(
     capsys, tmp_path, folder, calibration, monkeypatch
 ):
-    from omsm_ros.cli import aligning
+    from omsm_ros.cli import align
 
     asked = []
 
     def refuse(bag, known_calibration, radius, known, progress):
         asked.append((radius, known))
-        raise aligning.quantities.DataError("enough")
+        raise align.quantities.DataError("enough")
 
-    monkeypatch.setattr(aligning, "alignment_of", refuse)
+    monkeypatch.setattr(align, "alignment_of", refuse)
     (tmp_path / "known.yaml").write_text("abbe_arm: 0.12\nprobe_z: 0.3\n")
     words = ["align", folder / "scan.mcap", "--calibration", calibration, "--radius", "-0.05"]
     words += ["--geometry", tmp_path / "known.yaml", "--out", tmp_path / "geometry.yaml"]

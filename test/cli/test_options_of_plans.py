@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import command_line, starting
-from omsm_ros.jobs import examine_host
+from omsm_ros.cli import command_line, start
+from omsm_ros.pipelines import examine_host
 
 
 def run(capsys, *words):
@@ -169,7 +169,7 @@ def test_doctor_looks_for_the_port_that_is_named(capsys, monkeypatch):
         asked.append((str(folder), port))
         return [examine_host._serial(port)]
 
-    monkeypatch.setattr(starting, "examine_host", examine)
+    monkeypatch.setattr(start, "examine_host", examine)
     status, out, err = run(capsys, "doctor", "--port", "/dev/ttyNONE", "--folder", "/data")
     assert status == 2
     assert "no /dev/ttyNONE" in out
@@ -188,7 +188,7 @@ class Made:
 
 def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(starting, "record_twin", lambda *given: asked.append(given) or Made())
+    monkeypatch.setattr(start, "record_twin", lambda *given: asked.append(given) or Made())
     words = ["twin", "--out", tmp_path, "--seed", 7, "--part", 3, "--rpm", 45, "--feed", 2e-4]
     run(capsys, *words, "--radius", 1e-3, "--disturbances", "bad.yaml")
     run(capsys, *words[:5])

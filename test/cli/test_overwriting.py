@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.cli import main
-from omsm_ros.cli.overwriting import check_outputs
+from omsm_ros.cli.command_line import check_outputs
 from omsm_ros.errors import ConfigurationError
 
 

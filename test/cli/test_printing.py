@@ -8,7 +8,7 @@ import pytest
 
 import omsm_ros
 from omsm_ros import cli
-from omsm_ros.cli.printing import say, table
+from omsm_ros.cli.command import say, table
 
 from .written import write
 
@@ -47,7 +47,7 @@ def test_commands_print_at_one_place():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Name) and node.id == "print":
                 calls[path.name] = calls.get(path.name, 0) + 1
-    assert calls == {"printing.py": 1, "command_line.py": 3}
+    assert calls == {"command.py": 1, "command_line.py": 3}
 
 
 def test_what_is_written_is_where_the_line_says(capsys, small_scan, calibration, tmp_path):

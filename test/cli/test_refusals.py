@@ -8,10 +8,10 @@ from contextlib import contextmanager
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import inspecting, starting
-from omsm_ros.jobs import examine_host
-from omsm_ros.storage import bags
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.cli import inspect, start
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.pipelines import examine_host
 
 # Of parts longer than any name can be: nothing can be made there.
 LONG = "/".join(["folder" * 50] * 10)
@@ -95,12 +95,12 @@ def test_a_library_that_may_open_no_more_files_is_no_defect(capsys, monkeypatch)
     def fails(*_):
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    monkeypatch.setattr(inspecting, "inspect_bag", fails)
+    monkeypatch.setattr(inspect, "inspect_bag", fails)
     assert "too many open files" in refused(capsys, "inspect", "a.mcap")
 
 
 def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(starting, "examine_host", lambda *_: [examine_host._open_files()])
+    monkeypatch.setattr(start, "examine_host", lambda *_: [examine_host._open_files()])
     assert cli.main(["doctor"]) == 0
     capsys.readouterr()
     with open_files_at_most(0) as most:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.storage import calibration_file
+from omsm_ros.io import calibration_file
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN

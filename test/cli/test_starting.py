@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import starting
-from omsm_ros.jobs.examine_host import Check
+from omsm_ros.cli import start
+from omsm_ros.pipelines.examine_host import Check
 
 
 def test_omsm_alone_tells_what_to_do_next(capsys):
@@ -19,7 +19,7 @@ def test_omsm_alone_tells_what_to_do_next(capsys):
 
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
     checks = [Check("disk", "fine", "room"), Check("ROS 2", "faulty", "no omsm_msgs", "build it")]
-    monkeypatch.setattr(starting, "examine_host", lambda folder, port: checks)
+    monkeypatch.setattr(start, "examine_host", lambda folder, port: checks)
     assert cli.main(["doctor", "--folder", str(tmp_path)]) == 2
     out, err = capsys.readouterr()
     assert "NO  ROS 2" in out

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
-from omsm_ros.storage import bags, cloud_file, files, machine_files, motion_file
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags, descriptions, files, results
+from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.scenario import Scenario, spiral_of
 
@@ -88,7 +88,7 @@ def test_a_wrong_motion_file_is_refused(tmp_path, text, named):
     path = tmp_path / "motion.csv"
     path.write_text(text)
     with pytest.raises(files.FileError, match=named):
-        motion_file.load_motion(path)
+        descriptions.load_motion(path)
 
 
 def test_align_finds_the_spindle(capsys, tmp_path, calibration):
@@ -118,7 +118,7 @@ def test_align_finds_the_spindle(capsys, tmp_path, calibration):
     assert found["used"] == account["corrected"]
     # Across the feed, a sphere that runs true shows an offset in second order only.
     assert found["uncertainty"]["centre_y"] > 10e-6
-    assert machine_files.load_geometry(out).centre_x == found["geometry"]["centre_x"]
+    assert descriptions.load_geometry(out).centre_x == found["geometry"]["centre_x"]
 
 
 def sphere_aligned(tmp_path, calibration, radius):
@@ -176,7 +176,7 @@ def test_a_wrong_geometry_file_is_refused(tmp_path, text):
     path = tmp_path / "geometry.yaml"
     path.write_text(text)
     with pytest.raises(files.FileError, match="geometry"):
-        machine_files.load_geometry(path)
+        descriptions.load_geometry(path)
 
 
 def test_correct_refuses_a_foreign_calibration_unless_told(capsys, tmp_path, scan_bag, calibration):
@@ -215,6 +215,6 @@ def test_streams_of_different_rates_are_joined_by_their_stamps(
     assert account["received"] == 40_000
     assert account["corrected"] > 39_900
     assert account["corrected"] + sum(account["counted"].values()) == 40_000
-    cloud = cloud_file.CloudFile(tmp_path / "out" / "cloud.ply").read()
+    cloud = results.CloudFile(tmp_path / "out" / "cloud.ply").read()
     error = cloud["height"] - small_scan.surface_height[cloud["sample"]]
     assert np.sqrt(np.mean(error**2)) < 1.1 * np.hypot(10e-9, 10e-9 / np.sqrt(12))

@@ -3,8 +3,8 @@
 import json
 
 from omsm_ros import cli
-from omsm_ros.storage import bags
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 SPHERE_RADIUS_M = 0.05

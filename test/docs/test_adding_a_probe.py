@@ -17,9 +17,9 @@ def test_the_page_runs_from_top_to_bottom():
 
 
 def test_every_name_the_page_points_at_exists():
-    from omsm_ros.devices.factory import DEVICES, PARAMETERS
-    from omsm_ros.devices.trace import ReplayTransport
-    from omsm_ros.emulators.players import EMULATED
+    from omsm_ros.instruments.emulator_factory import EMULATED
+    from omsm_ros.instruments.factory import DEVICES, PARAMETERS
+    from omsm_ros.instruments.trace import ReplayTransport
 
     assert DEVICES
     assert PARAMETERS
@@ -28,7 +28,7 @@ def test_every_name_the_page_points_at_exists():
 
 
 def test_every_device_stands_in_the_table():
-    from omsm_ros.devices.factory import DEVICES
+    from omsm_ros.instruments.factory import DEVICES
 
     table = (PAGE.parent / "devices.md").read_text(encoding="utf-8")
     for name in DEVICES:

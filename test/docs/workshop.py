@@ -8,10 +8,9 @@ import numpy as np
 import yaml
 
 from omsm_ros import cli
-from omsm_ros.core.machine.trajectories import Chirp, Spiral
+from omsm_ros.core.kinematics.trajectories import Chirp, Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
-from omsm_ros.jobs.record_twin import write_nominal
-from omsm_ros.jobs.write_recording import write_recording
+from omsm_ros.pipelines.record_twin import write_nominal, write_recording
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of, scan_of
 

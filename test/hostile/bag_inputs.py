@@ -11,7 +11,7 @@ from hostile.inputs import NUMBERS, damaged
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from omsm_ros.storage import bags, conversions, message_types
+from omsm_ros.io import bags, message_mapping
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 _COUNTERS = st.one_of(
@@ -30,13 +30,13 @@ _LENGTHS = st.sampled_from([0, 1, 99, 101])
 
 def messages_of(blocks: list[tuple[Any, Any]]) -> list[tuple[str, Any]]:
     """Messages of pairs of blocks, by topic."""
-    classes = message_types.bag_messages()
+    classes = message_mapping.bag_messages()
     return [
         item
         for axes, distance in blocks
         for item in (
-            (bags.AXES_TOPIC, conversions.axis_message(classes, axes)),
-            (bags.DISTANCE_TOPIC, conversions.distance_message(classes, distance)),
+            (bags.AXES_TOPIC, message_mapping.axis_message(classes, axes)),
+            (bags.DISTANCE_TOPIC, message_mapping.distance_message(classes, distance)),
         )
     ]
 
@@ -106,7 +106,7 @@ def write_bag(folder: Path, how: tuple[Any, ...]) -> str:
         plugin is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE
     ):
         writer.set_compression(mode, CompressionFormat.ZSTD)
-    store = message_types.typestore()
+    store = message_mapping.typestore()
     with writer:
         connections = {
             topic: writer.add_connection(topic, bags.TOPIC_TYPES[topic], typestore=store)

@@ -12,7 +12,7 @@ from hostile.arguments import SETTINGS, arguments
 from hostile.judge import Case
 from hypothesis import strategies as st
 
-from omsm_ros.storage.files import SUMMARY
+from omsm_ros.io.files import SUMMARY
 
 Cases = st.SearchStrategy[Callable[[], Case]]
 Strategy = Callable[[Path, Any], Cases]

@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from omsm_ros.core.dynamics.calibration import content_id
+from omsm_ros.core.calibration.calibration import content_id
 
 NUMBERS = st.one_of(
     st.sampled_from([0, -0.0, 1, -1, 5, 1e-300, 1e300, -1e300, 5e-324, 1e-15, 1e15, 1e5, 1000.0]),

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros import cli
-from omsm_ros.storage.cloud_file import CloudFile
+from omsm_ros.io.results import CloudFile
 
 LONGEST_S = 5.0
 MOST_BYTES = 1024**3

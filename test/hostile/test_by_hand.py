@@ -18,8 +18,8 @@ from hostile import maps, trees
 from hostile.judge import Case, ask, ask_process, judge, refused
 
 from omsm_ros.errors import FileError
-from omsm_ros.storage.bags import AXES_TOPIC, DISTANCE_TOPIC, BagReader
-from omsm_ros.storage.files import save_text
+from omsm_ros.io.bags import AXES_TOPIC, DISTANCE_TOPIC, BagReader
+from omsm_ros.io.files import save_text
 
 EXPORT = ("export", "{}", "--unit", "mm", "--out", "e.x3p")
 SHOW = ("surface", "show", "{}", "--radius", "0.002")

@@ -22,14 +22,14 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from omsm_ros import cli
-from omsm_ros.core.correction.calibration_set import calibration_set
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.kinematics import Geometry
-from omsm_ros.core.sampled.model import Discrete, SampledModel
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.machine_files import save_geometry
-from omsm_ros.storage.model_file import save_model
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.core.calibration.calibration_set import calibration_set
+from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.io.descriptions import save_geometry
+from omsm_ros.io.model_file import save_model
 from omsm_ros.twin.cell import blocks_of
 
 MODEL = SampledModel(

@@ -13,10 +13,10 @@ import pytest
 from hostile import maps, trees
 from hostile.judge import Case, ask, judge
 
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.message_types import typestore
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.io.message_mapping import typestore
 from omsm_ros.twin.cell import blocks_of
 
 

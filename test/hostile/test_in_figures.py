@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from hostile.judge import Case, ask, ask_process, judge
 
-from omsm_ros.report.common import style
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.report import style
 
 NAMES = [r"$\frac$", "a$b$c^", "$$", "旋盤 7", "a\x1b[31m", "100 %_{"]
 

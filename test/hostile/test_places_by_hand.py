@@ -13,7 +13,7 @@ from hostile import maps, trees
 from hostile.bag_inputs import TOPICS
 from hostile.judge import Case, ask, judge, refused
 
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io.bag_writer import BagWriter
 
 EXPORT = ("export", "{}", "--unit", "m", "--out", "e.x3p")
 IMPORT = ("import", "{}", "--map", "map.yaml", "--out", "new.mcap")

@@ -7,7 +7,7 @@ import pytest
 from hostile import shop
 
 from omsm_ros import cli
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.io.calibration_file import save_calibration
 
 TIME = np.arange(300) * 1e-3
 ROWS = [["time_s", "z_m"], *([f"{t:.3f}", f"{1e-5 * np.sin(30 * t):.9f}"] for t in TIME)]

@@ -9,7 +9,7 @@ from typing import Any
 from hostile.inputs import NUMBERS, VALUES, damaged
 from hypothesis import strategies as st
 
-from omsm_ros.core.dynamics.calibration import content_id
+from omsm_ros.core.calibration.calibration import content_id
 
 _SCALES = st.sampled_from([-1, 0, 1e-30, 1e-6, 1e-3, 1e3, 1e6, 1e30])
 

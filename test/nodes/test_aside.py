@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
-from omsm_ros.nodes.aside import Aside
+from omsm_ros.nodes.background_worker import Aside
 
 
 def outcome(awaited):

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from omsm_ros.errors import CalibrationError
+from omsm_ros.io import message_mapping
 from omsm_ros.nodes.calibration_topic import TOPIC, CalibrationTopic
-from omsm_ros.storage import conversions
 
 from .fake_node import STARTED_NS, FakeNode
 
@@ -22,7 +22,7 @@ class Cell:
     def __init__(self, listens=True):
         self.node, self.taken, self.refuses = FakeNode(), [], set()
         self.topic = CalibrationTopic(self.node, ExitStack(), self.take, listens)
-        self.made = conversions.ros_messages()
+        self.made = message_mapping.ros_messages()
 
     def take(self, calibration, since_ns):
         if calibration.id in self.refuses:
@@ -31,14 +31,14 @@ class Cell:
 
     def hear(self, calibration, since_ns):
         self.topic._on_message(
-            conversions.calibration_message(self.made, calibration, since_ns), {}
+            message_mapping.calibration_message(self.made, calibration, since_ns), {}
         )
 
     @property
     def said(self):
         """Ids and stamps of what was published."""
         messages = self.node.messages(TOPIC)
-        return [(message.id, conversions.stamp_of(message)) for message in messages]
+        return [(message.id, message_mapping.stamp_of(message)) for message in messages]
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_what_is_decided_now_is_newer_than_all_before(cell, two):
 
 
 def test_a_message_that_is_none_is_refused_in_one_line(cell, two):
-    message = conversions.calibration_message(cell.made, two[0], STARTED_NS)
+    message = message_mapping.calibration_message(cell.made, two[0], STARTED_NS)
     message.sample_period = -1.0
     cell.topic._on_message(message, {})
     assert cell.topic.calibration is None

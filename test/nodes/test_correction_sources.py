@@ -6,9 +6,9 @@ import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.errors import FileError
-from omsm_ros.jobs.judge_scan import live_light, with_sources
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, sources_of
-from omsm_ros.nodes.correction_state import light_values
+from omsm_ros.nodes.corrector_node import light_values
+from omsm_ros.pipelines.measure import live_light, with_sources
 
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 FILE = """\

@@ -9,8 +9,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 from two_counters import CALIBRATION, blocks, motion, watched
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.samples.slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.nodes.correction_state import CorrectionState
+from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
+from omsm_ros.nodes.corrector_node import CorrectionState
 from omsm_ros.nodes.diagnostics import ERROR
 
 

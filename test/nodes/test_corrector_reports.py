@@ -8,8 +8,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 from two_counters import CALIBRATION, PERIOD
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.nodes.correction_state import CorrectionState
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.nodes.corrector_node import CorrectionState
 from omsm_ros.nodes.diagnostics import ERROR, OK, STALE, WARN
 
 BLOCK = 100

@@ -12,12 +12,12 @@ from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 
 from omsm_ros import quantities
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.nodes.correction_parameters import PARAMETERS as OF_CORRECTOR
 from omsm_ros.nodes.correction_parameters import accuracy_of, options_of, trigger_of
-from omsm_ros.nodes.declared import Declared
-from omsm_ros.parameters import Parameter
+from omsm_ros.nodes.managed import Declared
+from omsm_ros.quantities import Parameter
 
 from .fake_node import FakeNode
 

@@ -8,13 +8,13 @@ import pytest
 
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.samples.recent import Flow, RecentIncrease
-from omsm_ros.devices.reader import State
-from omsm_ros.nodes import driving
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.instruments.reader import State
+from omsm_ros.io import message_mapping
+from omsm_ros.nodes import driver as driving
 from omsm_ros.nodes.diagnostics import ERROR, OK, STALE, WARN
-from omsm_ros.nodes.driving import DriverNode
-from omsm_ros.storage import conversions
+from omsm_ros.nodes.driver import DriverNode
 
 
 class Published(list):
@@ -49,7 +49,8 @@ def driver(monkeypatch):
         _device=SimpleNamespace(counts=lambda: dict(counts), identity={"version": "2.1"},
                                 settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
-        _recent=RecentIncrease(), _flow=Flow(), _reported={}, _messages=conversions.ros_messages(),
+        _recent=RecentIncrease(), _flow=Flow(), _reported={},
+        _messages=message_mapping.ros_messages(),
         _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
         _settings=Published(),
     )  # fmt: skip

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
-from omsm_ros.nodes import listeners as module
-from omsm_ros.nodes.listeners import Listeners
+from omsm_ros.nodes import player_node as module
+from omsm_ros.nodes.player_node import Listeners
 
 TOPIC = "/omsm/axes"
 

@@ -13,10 +13,10 @@ from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
-from omsm_ros.core.machine.kinematics import Geometry, beam_quaternion
+from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.frames import tell_frames
+from omsm_ros.nodes.corrector_node import tell_frames
 from omsm_ros.nodes.running import Paced, refuse, serve, settings_of
 
 from .fake_node import FakeNode

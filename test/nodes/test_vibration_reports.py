@@ -9,20 +9,20 @@ import pytest
 
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
-from omsm_ros.core.samples.blocks import AccelerationBlock
-from omsm_ros.core.samples.recent import Flow, RecentIncrease
-from omsm_ros.core.spectra.running_spectrum import (
+from omsm_ros.core.ripple.accelerometer import (
     CARRIAGE,
     PROBE,
     Alarm,
     MonitorOptions,
     RunningSpectrum,
 )
+from omsm_ros.core.streams.blocks import AccelerationBlock
+from omsm_ros.core.streams.stamps import Flow, RecentIncrease
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.io import message_mapping
 from omsm_ros.nodes import vibration_monitor_node as module
 from omsm_ros.nodes.diagnostics import OK, STALE, WARN
 from omsm_ros.nodes.vibration_monitor_node import VibrationMonitorNode, _edges
-from omsm_ros.storage import conversions
 
 RATE, LINE_HZ = 2000.0, 120.0
 EMPTY = SimpleNamespace(
@@ -76,7 +76,7 @@ def shake(monitor, seconds, amplitude_m, along="z"):
         record = AccelerationBlock(
             stamp_ns=0, first_sample=monitor.sent, sample_period=1 / RATE, **axes
         )
-        message = conversions.acceleration_message(conversions.ros_messages(), record)
+        message = message_mapping.acceleration_message(message_mapping.ros_messages(), record)
         monitor._take(message, {})
         monitor.sent += block
         monitor.now[0] += 0.1
@@ -177,7 +177,7 @@ def test_a_block_that_is_none_is_refused_by_its_reason(made):
         y=np.zeros(3),
         z=np.zeros(3),
     )
-    message = conversions.acceleration_message(conversions.ros_messages(), record)
+    message = message_mapping.acceleration_message(message_mapping.ros_messages(), record)
     message.sample_period = 0.0
     monitor._take(message, {})
     report = monitor.report()
@@ -188,7 +188,7 @@ def test_a_block_that_is_none_is_refused_by_its_reason(made):
 
 def test_a_refusal_of_long_ago_is_a_number_only(made, now):
     monitor = made()
-    monitor._take(conversions.acceleration_message(conversions.ros_messages(), EMPTY), {})
+    monitor._take(message_mapping.acceleration_message(message_mapping.ros_messages(), EMPTY), {})
     assert "refused" in monitor.report().text
     for _ in range(3):
         now[0] += 6.0

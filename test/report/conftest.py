@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.latency import declared
+from omsm_ros.core.calibration.calibration import declared
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.report.measurement.cloud_view import CloudView
-from omsm_ros.twin.figure_error import FigureError
+from omsm_ros.report.measurement.surface_map import CloudView
+from omsm_ros.twin.part import FigureError
 
 POINTS = 40_000
 TURNS = 64

@@ -11,22 +11,21 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
 
+from omsm_ros.core.calibration.verification import PathCheck
 from omsm_ros.core.comparison.agreement import TermNumber
 from omsm_ros.core.comparison.compare import compare
 from omsm_ros.core.comparison.stated_errors import Measurement as Measured
-from omsm_ros.core.spectra.density import density
-from omsm_ros.core.spectra.hypotheses import KINDS, PART, VIBRATION
-from omsm_ros.core.spectra.line import Line
-from omsm_ros.core.spectra.ripple_guard import Named
-from omsm_ros.core.spectra.scan_signal import PATH, TIME, ScanSignal
+from omsm_ros.core.ripple.density import density
+from omsm_ros.core.ripple.ripple_guard import Named
+from omsm_ros.core.ripple.scan_signal import PATH, TIME, ScanSignal
+from omsm_ros.core.ripple.source_hypotheses import KINDS, PART, VIBRATION
+from omsm_ros.core.ripple.spectral_line import Line
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.core.verification.free_path import PathCheck
-from omsm_ros.report.campaign import history_figure
-from omsm_ros.report.campaign import page as campaign_page
-from omsm_ros.report.common import style
-from omsm_ros.report.difference import figures as difference_figures
-from omsm_ros.report.experiments import figures as experiment_figures
-from omsm_ros.report.spectrum import figures as spectrum_figures
+from omsm_ros.report import campaign, style
+from omsm_ros.report import campaign as campaign_page
+from omsm_ros.report import difference as difference_figures
+from omsm_ros.report import experiments as experiment_figures
+from omsm_ros.report import spectrum as spectrum_figures
 
 DAY_NS = 86_400 * 10**9
 
@@ -161,7 +160,7 @@ def test_each_machine_has_its_colour_and_a_rejected_calibration_is_a_cross(drawn
         ),
         SimpleNamespace(machine="", calibrations=[calibrated(3)], measurements=[]),
     ]  # fmt: skip
-    png = history_figure.draw(machines)
+    png = campaign.draw(machines)
     assert imread(io.BytesIO(png)).shape[2] == 4
     lag, gain, form = drawn[0].axes
     marks = [(line.get_marker(), line.get_ydata().tolist()) for line in points_of(lag)]
@@ -184,7 +183,7 @@ def test_each_machine_has_its_colour_and_a_rejected_calibration_is_a_cross(drawn
 
 
 def test_a_history_of_nothing_is_a_picture(drawn):
-    assert history_figure.draw([]).startswith(b"\x89PNG")
+    assert campaign.draw([]).startswith(b"\x89PNG")
     assert drawn[0].axes[0].get_legend() is None
 
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from page_tables import PageTables, says, value_of
 
-from omsm_ros.core.spectra import hypotheses
-from omsm_ros.core.spectra.hypotheses import KINDS, PART
-from omsm_ros.report.experiments.page import Compared, ExperimentPage
-from omsm_ros.report.experiments.page import render as render_experiment
+from omsm_ros.core.ripple import source_hypotheses
+from omsm_ros.core.ripple.source_hypotheses import KINDS, PART
+from omsm_ros.report.experiments import Compared, ExperimentPage
+from omsm_ros.report.experiments import render as render_experiment
 from omsm_ros.report.measurement.page import Report, render
-from omsm_ros.report.spectrum.page import SpectrumPage
-from omsm_ros.report.spectrum.page import render as render_spectrum
+from omsm_ros.report.spectrum import SpectrumPage
+from omsm_ros.report.spectrum import render as render_spectrum
 
 # Whatever a machine may give: from picometres to metres, and what nobody knows.
 LENGTH = st.floats(1e-12, 1.0)
@@ -238,8 +238,10 @@ def test_scans_sampling_and_band_stop_are_told_in_their_units():
      (["PART", "UNDECIDED"], "unknown", "Not all decided")],
 )  # fmt: skip
 def test_the_verdict_counts_the_lines(peaks, level, word):
-    kinds = [getattr(hypotheses, name) for name in peaks]
-    told = [peak(k, needs="one more scan" if k == hypotheses.UNDECIDED else None) for k in kinds]
+    kinds = [getattr(source_hypotheses, name) for name in peaks]
+    told = [
+        peak(k, needs="one more scan" if k == source_hypotheses.UNDECIDED else None) for k in kinds
+    ]
     html = render_spectrum(SpectrumPage(spectrum_summary(told), {}))
     assert f'class="verdict {level}"' in html
     assert word in html

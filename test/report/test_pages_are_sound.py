@@ -13,26 +13,24 @@ import pytest
 from page_tables import PageTables
 from parsed_page import Page
 
-from omsm_ros.core.sampled.free_run import free_run
-from omsm_ros.core.sampled.model import Discrete, SampledModel
-from omsm_ros.core.spectra.hypotheses import KINDS
-from omsm_ros.report.campaign.page import Measurement
-from omsm_ros.report.campaign.page import render as render_campaign
+from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel, free_run
+from omsm_ros.core.ripple.source_hypotheses import KINDS
+from omsm_ros.live_page.server import render as render_live
+from omsm_ros.report.campaign import Measurement
+from omsm_ros.report.campaign import render as render_campaign
 from omsm_ros.report.certificate.model_page import ModelPage, render_model
 from omsm_ros.report.certificate.page import CertificatePage
 from omsm_ros.report.certificate.page import render as render_certificate
-from omsm_ros.report.common.page_parts import Section
-from omsm_ros.report.common.study_page import StudyPage, fill_study
-from omsm_ros.report.common.tables import Table
-from omsm_ros.report.common.verdict import Verdict
-from omsm_ros.report.experiments.page import Compared, ExperimentPage
-from omsm_ros.report.experiments.page import render as render_experiment
-from omsm_ros.report.live.page import render as render_live
-from omsm_ros.report.maps.surface_map import Layer, embedded
+from omsm_ros.report.experiments import Compared, ExperimentPage
+from omsm_ros.report.experiments import render as render_experiment
 from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report
-from omsm_ros.report.spectrum.page import SpectrumPage
-from omsm_ros.report.spectrum.page import render as render_spectrum
+from omsm_ros.report.measurement.surface_map import Layer, embedded
+from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.spectrum import SpectrumPage
+from omsm_ros.report.spectrum import render as render_spectrum
+from omsm_ros.report.tables import Table
+from omsm_ros.report.verdict import Verdict
 
 # One for each place that text can stand in: an element, an attribute, a script, a comment, a
 # template. No digit with a minus before it, and none with a unit behind: those are typeset.

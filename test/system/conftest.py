@@ -34,14 +34,14 @@ class Cell:
         self.processes.start("cell_emulator", **(given | parameters))
 
     def start_driver(self, **parameters):
-        from omsm_ros.emulators.players import emulated
+        from omsm_ros.instruments.emulator_factory import emulated
 
         given = {"port": self.link} | emulated("six_channel").driver
         self.processes.start("confocal_driver", **(given | parameters))
 
     def start_correcting(self, calibration, driver=None, **emulator):
         """Emulator, driver and corrector, all connected."""
-        from omsm_ros.storage.calibration_file import save_calibration
+        from omsm_ros.io.calibration_file import save_calibration
 
         path = self.folder / "cal.json"
         save_calibration(path, calibration)
@@ -110,7 +110,7 @@ class Cell:
 def cell(tmp_path, monkeypatch):
     """All that is started ends with the test; it is started in the test's folder."""
     monkeypatch.chdir(tmp_path)
-    from omsm_ros.nodes.processes import NodeProcesses
+    from omsm_ros.nodes.cell_demo_node import NodeProcesses
 
     with NodeProcesses(tmp_path / "log") as processes:
         made = Cell(tmp_path, processes)

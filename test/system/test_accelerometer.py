@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from omsm_msgs.msg import AccelerationBlock
 
-from omsm_ros.storage import conversions
+from omsm_ros.io import message_mapping
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -19,7 +19,7 @@ def test_a_line_of_vibration_arrives_with_its_size(cell):
     address = "synthetic://?frequency=125&amplitude=0.05&noise=0.001"
     cell.processes.start("accelerometer_driver", port=address, sample_period=5e-4, block_size=200)
     cell.wait("four thousand samples", lambda: len(heard) >= 20)
-    blocks = [conversions.acceleration_block(message) for message in heard[:20]]
+    blocks = [message_mapping.acceleration_block(message) for message in heard[:20]]
     firsts = np.array([block.first_sample for block in blocks])
     assert np.all(np.diff(firsts) == 200)
     x = np.concatenate([block.x for block in blocks])

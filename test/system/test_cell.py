@@ -7,11 +7,11 @@ import pytest
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from std_srvs.srv import Trigger
 
-from omsm_ros.core.dynamics.calibration import Calibration
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import DeviceTimeoutError
-from omsm_ros.jobs import demonstrate as demonstration
+from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.cell_demo_node import Stage, perform
-from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.pipelines import demonstrate as demonstration
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -191,8 +191,8 @@ def test_calibrator_answers_bad_requests_and_stays(cell):
 
 
 def test_calibrator_identifies_from_a_bag(cell, tmp_path, step_test):
-    from omsm_ros.storage import bags
-    from omsm_ros.storage.recording.bag_writer import BagWriter
+    from omsm_ros.io import bags
+    from omsm_ros.io.bag_writer import BagWriter
     from omsm_ros.twin.cell import blocks_of
 
     bag = tmp_path / "steps.mcap"

@@ -8,9 +8,9 @@ pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
 
 from omsm_msgs.srv import Identify
 
-from omsm_ros.jobs.keep_history import history
-from omsm_ros.storage import bags
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.pipelines.history import history
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.scenario import Scenario, step_test_of
 

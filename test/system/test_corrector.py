@@ -10,11 +10,11 @@ from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.msg import DistanceBlock as DistanceMessage
 from omsm_msgs.srv import LoadCalibration, PredictError
 
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.io import bags, message_mapping
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_QOS
-from omsm_ros.storage import bags, conversions
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
 
 pytestmark = pytest.mark.timeout(120)
@@ -37,14 +37,14 @@ class Feed:
     """Publishes pairs of blocks to the corrector, and reads its clouds."""
 
     def __init__(self, cell):
-        self._cell, self._messages = cell, conversions.ros_messages()
+        self._cell, self._messages = cell, message_mapping.ros_messages()
         self.clouds = cell.clouds()
         self._axes = cell.publisher("axes", AxisMessage)
         self._distance = cell.publisher("confocal", DistanceMessage)
 
     def send(self, axes, distance):
-        self._axes.publish(conversions.axis_message(self._messages, axes))
-        self._distance.publish(conversions.distance_message(self._messages, distance))
+        self._axes.publish(message_mapping.axis_message(self._messages, axes))
+        self._distance.publish(message_mapping.distance_message(self._messages, distance))
 
     def answer(self, axes, distance):
         """The next cloud."""
@@ -76,7 +76,7 @@ def test_settings_that_differ_are_refused_on_every_way_in(cell, true_calibration
 
     latched = cell.operator.create_publisher(CalibrationMessage, "/omsm/calibration", LATCHED_QOS)
     latched.publish(
-        conversions.calibration_message(conversions.ros_messages(), true_calibration, 0)
+        message_mapping.calibration_message(message_mapping.ros_messages(), true_calibration, 0)
     )
     log = cell.folder / "log" / "corrector.log"
     cell.wait("the refusal", lambda: "calibration refused" in log.read_text())
@@ -148,7 +148,7 @@ def test_geometry_parameters_place_the_points(cell, true_calibration):
     cloud = feed.answer(
         *blocks(z=np.full(COUNT, z), distance=np.full(COUNT, reading), x=x, y=y, b=b, c=c)
     )
-    points = conversions.cloud_array(cloud)
+    points = message_mapping.cloud_array(cloud)
     assert len(points) > COUNT - 50
     beam = np.array([given["beam_x"], given["beam_y"], 1.0])
     beam /= np.linalg.norm(beam)

@@ -73,7 +73,7 @@ def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
 
 
 def test_a_dark_reference_is_taken_where_the_probe_can(cell):
-    from omsm_ros.emulators.players import emulated
+    from omsm_ros.instruments.emulator_factory import emulated
 
     cell.start_emulator(device="chrocodile")
     cell.start_driver(**({"device": "chrocodile"} | emulated("chrocodile").driver))

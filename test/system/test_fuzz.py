@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_QOS
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
 
 pytestmark = pytest.mark.timeout(0)
 
@@ -101,18 +101,18 @@ def test_messages(cell, true_calibration, small_scan_blocks, count):
     latched = cell.operator.create_publisher(Calibration, "/omsm/calibration", LATCHED_QOS)
     axes = cell.publisher("axes", AxisBlock, 2)
     distance = cell.publisher("confocal", DistanceBlock, 2)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
 
     @settings(max_examples=count, **FUZZ)
     @given(blocks(), CALIBRATIONS)
     def attack(block, calibration):
         x, d, first, other, period, second = block
-        header = conversions.header(messages, second * 10**9 // 7, "f")
+        header = message_mapping.header(messages, second * 10**9 // 7, "f")
         axes.publish(AxisBlock(header=header, first_sample=first, sample_period=period, **x))
         distance.publish(
             DistanceBlock(header=header, first_sample=other, sample_period=period, **d)
         )
-        message = conversions.calibration_message(messages, true_calibration, 0)
+        message = message_mapping.calibration_message(messages, true_calibration, 0)
         for name, value in calibration.items():
             setattr(message, name, value)
         latched.publish(message)
@@ -122,8 +122,8 @@ def test_messages(cell, true_calibration, small_scan_blocks, count):
         cell.settle(node, "blocks_refused")
     before = cell.settle("corrector", "axes_received")
     for pair in small_scan_blocks[:20]:
-        axes.publish(conversions.axis_message(messages, pair[0]))
-        distance.publish(conversions.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.axis_message(messages, pair[0]))
+        distance.publish(message_mapping.distance_message(messages, pair[1]))
     sent = sum(len(pair[0]) for pair in small_scan_blocks[:20])
     cell.wait(
         "the good blocks",

@@ -12,9 +12,9 @@ from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from rclpy.qos import QoSProfile
 
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_QOS
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
 
 NAN, INF = float("nan"), float("inf")
 WAVE = [1e-6 * (k % 50) for k in range(400)]
@@ -100,7 +100,7 @@ def hostile_calibrations(good):
         {"certificate": '{"noise_m": 1e999}'}, {"id": "x" * 10_000},
     ]  # fmt: skip
     for change in changes:
-        message = conversions.calibration_message(conversions.ros_messages(), good, 0)
+        message = message_mapping.calibration_message(message_mapping.ros_messages(), good, 0)
         for name, value in change.items():
             is_array = isinstance(value, list)
             setattr(message, name, array.array("d", value) if is_array else value)
@@ -114,8 +114,8 @@ def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small
     cell.wait("the corrector to listen", lambda: latched.get_subscription_count() >= 1)
     for message in hostile_calibrations(true_calibration):
         latched.publish(message)
-    messages = conversions.ros_messages()
-    latched.publish(conversions.calibration_message(messages, true_calibration, 0))
+    messages = message_mapping.ros_messages()
+    latched.publish(message_mapping.calibration_message(messages, true_calibration, 0))
     cell.wait(
         "the good calibration to be taken",
         lambda: cell.operator.text("corrector", "calibration") == true_calibration.id,
@@ -126,15 +126,15 @@ def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small
         for period, first in ((1e300, 0), (1e-300, 0), (NAN, 0), (1e-3, 2**64 - 1), (1e-3, 2**53)):
             for to, make, block in zip(
                 (axes, distance),
-                (conversions.axis_message, conversions.distance_message),
+                (message_mapping.axis_message, message_mapping.distance_message),
                 pair,
                 strict=True,
             ):
                 message = make(messages, block)
                 message.sample_period, message.first_sample = period, first
                 to.publish(message)
-        axes.publish(conversions.axis_message(messages, pair[0]))
-        distance.publish(conversions.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.axis_message(messages, pair[0]))
+        distance.publish(message_mapping.distance_message(messages, pair[1]))
     cell.wait(
         "the good blocks to be counted",
         lambda: cell.operator.value("corrector", "axes_received") >= 2000,

@@ -7,8 +7,8 @@ import pytest
 from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.srv import LoadCalibration
 
+from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, LATCHED_QOS
-from omsm_ros.storage.calibration_file import load_calibration, save_calibration
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -99,10 +99,10 @@ def test_what_the_corrector_refuses_is_not_in_force(cell, two):
     start_calibrator(cell)
     until(cell, "calibrator", first)
     other = cell.operator.create_publisher(CalibrationMessage, "/omsm/calibration", LATCHED_QOS)
-    from omsm_ros.storage import conversions
+    from omsm_ros.io import message_mapping
 
     now = cell.operator.get_clock().now().nanoseconds
-    message = conversions.calibration_message(conversions.ros_messages(), foreign, now)
+    message = message_mapping.calibration_message(message_mapping.ros_messages(), foreign, now)
     cell.wait("two listeners", lambda: other.get_subscription_count() >= 2)
     other.publish(message)
     cell.wait("the refusal", lambda: "refused" in cell.operator.text("corrector", "message"))

@@ -8,8 +8,8 @@ from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import Identify, PredictError
 from std_srvs.srv import Trigger
 
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.cell import blocks_of
 
 pytestmark = pytest.mark.timeout(180)
@@ -78,7 +78,7 @@ def test_a_killed_corrector_goes_on_where_it_comes_back(cell, true_calibration, 
 def single_samples(cell, count):
     """Blocks of one sample at 1 kHz to the corrector."""
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
     zero = [0.0]
     common = {"sample_period": 1e-3}
     made = (
@@ -92,7 +92,7 @@ def single_samples(cell, count):
             pass
         for publisher, message in zip((axes, distance), made, strict=True):
             message.first_sample = k
-            message.header = conversions.header(messages, due, "")
+            message.header = message_mapping.header(messages, due, "")
             publisher.publish(message)
 
 
@@ -114,10 +114,10 @@ def test_two_hundred_calls_at_once_are_all_answered(cell, step_test):
     """The first are worked on, the others are told to come again; no sample waits for them."""
     cell.processes.start("calibrator", output=str(cell.folder / "new.json"))
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
     for pair in blocks_of(step_test):
-        axes.publish(conversions.axis_message(messages, pair[0]))
-        distance.publish(conversions.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.axis_message(messages, pair[0]))
+        distance.publish(message_mapping.distance_message(messages, pair[1]))
     held = len(step_test.axes)
     cell.wait("all of it", lambda: cell.operator.value("calibrator", "axes_held") == held)
     client = cell.operator.create_client(Identify, "/omsm/calibrator/identify")
@@ -140,14 +140,14 @@ def test_a_prediction_does_not_stop_the_samples(cell, true_calibration, small_sc
     save_calibration(path, true_calibration)
     cell.processes.start("corrector", calibration=str(path))
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
     client = cell.operator.create_client(PredictError, "/omsm/corrector/predict_error")
     assert client.wait_for_service(10.0)
     z = [1e-6 * (k % 50) for k in range(200_000)]
     futures = [client.call_async(PredictError.Request(z=z, sample_period=1e-3)) for _ in range(3)]
     for pair in small_scan_blocks[:100]:
-        axes.publish(conversions.axis_message(messages, pair[0]))
-        distance.publish(conversions.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.axis_message(messages, pair[0]))
+        distance.publish(message_mapping.distance_message(messages, pair[1]))
     sent = sum(len(pair[0]) for pair in small_scan_blocks[:100])
     cell.wait("all samples", lambda: cell.operator.value("corrector", "distance_received") == sent)
     cell.wait("all answers", lambda: all(future.done() for future in futures))

@@ -13,7 +13,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.qos import ReliabilityPolicy
 
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.io.calibration_file import save_calibration
 
 pytestmark = pytest.mark.timeout(120)
 

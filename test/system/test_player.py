@@ -13,15 +13,15 @@ from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from omsm_ros.core.samples import blocks
-from omsm_ros.jobs.correct_bag import correct_bag
-from omsm_ros.jobs.demonstrate import same_points
+from omsm_ros.core.streams import blocks
+from omsm_ros.io import bags, message_mapping
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.io.message_mapping import bag_messages
+from omsm_ros.io.results import CloudFile
 from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS
-from omsm_ros.storage import bags, conversions
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.cloud_file import CloudFile
-from omsm_ros.storage.message_types import bag_messages
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.pipelines.correct import correct_bag
+from omsm_ros.pipelines.demonstrate import same_points
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -33,7 +33,7 @@ def record(path, pairs, calibration=None, names=None):
     with BagWriter(path, [*topics, bags.CALIBRATION_TOPIC], names) as bag:
         if calibration is not None:
             stamp = pairs[0][0].stamp_ns
-            message = conversions.calibration_message(bag_messages(), calibration, stamp)
+            message = message_mapping.calibration_message(bag_messages(), calibration, stamp)
             bag.write(bags.CALIBRATION_TOPIC, stamp, message)
         for axes, distance in pairs:
             bag.write_axes(axes)
@@ -95,7 +95,7 @@ def live_cloud(cell, path, calibration_file, **parameters):
     while time.monotonic() < deadline:
         rclpy.spin_once(cell.operator, timeout_sec=0.05)
     cell.operator._status.clear()
-    return np.concatenate([conversions.cloud_array(cloud) for cloud in clouds])
+    return np.concatenate([message_mapping.cloud_array(cloud) for cloud in clouds])
 
 
 def test_it_begins_only_when_those_listen_who_have_to(cell, small_scan_blocks):
@@ -206,8 +206,8 @@ def test_recorded_points_go_elsewhere_and_only_if_asked_for(cell, small_scan_blo
     with BagWriter(path, (bags.AXES_TOPIC, bags.POINTS_TOPIC)) as bag:
         for axes, _ in pairs:
             bag.write_axes(axes)
-            cloud = conversions.cloud_message(
-                bag_messages(), np.zeros(3, conversions.POINT_DTYPE), axes.stamp_ns
+            cloud = message_mapping.cloud_message(
+                bag_messages(), np.zeros(3, message_mapping.POINT_DTYPE), axes.stamp_ns
             )
             bag.write(bags.POINTS_TOPIC, axes.stamp_ns, cloud)
     live, elsewhere = cell.clouds(), hear(cell, PointCloud2, "/omsm/recorded/points")

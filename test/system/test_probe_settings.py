@@ -10,11 +10,11 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.errors import CalibrationError
-from omsm_ros.jobs import demonstrate as demonstration
-from omsm_ros.jobs.corrected_scan import CorrectedScan
-from omsm_ros.jobs.identify_bag import settings_of_bag
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.nodes.cell_demo_node import _follow, _scan
-from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.pipelines import demonstrate as demonstration
+from omsm_ros.pipelines.correct import CorrectedScan
+from omsm_ros.pipelines.identify import settings_of_bag
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.soak]
 

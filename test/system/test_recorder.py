@@ -10,11 +10,11 @@ import pytest
 import rclpy
 from omsm_msgs.msg import AxisBlock, Calibration
 
-from omsm_ros.core.samples import blocks
+from omsm_ros.core.streams import blocks
+from omsm_ros.io import bags, message_mapping
+from omsm_ros.io.bag_repair import repair
+from omsm_ros.io.bag_writer import next_free
 from omsm_ros.nodes.topics import LATCHED_QOS
-from omsm_ros.storage import bags, conversions
-from omsm_ros.storage.recording.bag_repair import repair
-from omsm_ros.storage.recording.bag_writer import next_free
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -41,7 +41,7 @@ class Source:
     def __init__(self, publisher):
         self.published = 0
         self._publisher = publisher
-        self._messages = conversions.ros_messages()
+        self._messages = message_mapping.ros_messages()
         self._zeros = {name: np.zeros(SAMPLES) for name in "xyzbc"}
 
     def publish(self, count, pause=0.0):
@@ -52,7 +52,7 @@ class Source:
                 sample_period=1e-3,
                 **self._zeros,
             )
-            self._publisher.publish(conversions.axis_message(self._messages, block))
+            self._publisher.publish(message_mapping.axis_message(self._messages, block))
             self.published += 1
             time.sleep(pause)
 
@@ -151,7 +151,7 @@ def test_the_calibration_is_recorded_and_its_durability(cell, true_calibration):
     path = cell.folder / "with.mcap"
     publisher = cell.operator.create_publisher(Calibration, "/omsm/calibration", LATCHED_QOS)
     publisher.publish(
-        conversions.calibration_message(conversions.ros_messages(), true_calibration, 7)
+        message_mapping.calibration_message(message_mapping.ros_messages(), true_calibration, 7)
     )
     # The recorder comes later, and is told.
     start_recorder(cell, path)

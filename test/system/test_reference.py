@@ -8,9 +8,9 @@ from omsm_msgs.msg import AxisBlock as AxisMessage
 from omsm_msgs.msg import DistanceBlock as DistanceMessage
 from omsm_msgs.srv import Identify
 
-from omsm_ros.core.samples.blocks import DistanceBlock
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import load_calibration
+from omsm_ros.core.streams.blocks import DistanceBlock
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
@@ -33,14 +33,14 @@ def reference_block(axes, random):
 def test_a_reference_over_dds_is_told_apart_and_can_be_the_input(cell, step_test):
     output = cell.folder / "cal.json"
     cell.processes.start("calibrator", output=str(output))
-    messages, random = conversions.ros_messages(), np.random.default_rng(5)
+    messages, random = message_mapping.ros_messages(), np.random.default_rng(5)
     kinds = {"axes": AxisMessage, "confocal": DistanceMessage, "reference": DistanceMessage}
     publishers = {topic: cell.publisher(topic, kind) for topic, kind in kinds.items()}
     for axes, distance in blocks_of(step_test):
         reference = reference_block(axes, random)
-        publishers["axes"].publish(conversions.axis_message(messages, axes))
-        publishers["confocal"].publish(conversions.distance_message(messages, distance))
-        publishers["reference"].publish(conversions.distance_message(messages, reference))
+        publishers["axes"].publish(message_mapping.axis_message(messages, axes))
+        publishers["confocal"].publish(message_mapping.distance_message(messages, distance))
+        publishers["reference"].publish(message_mapping.distance_message(messages, reference))
     samples = len(step_test.axes)
     for count in ("axes_held", "distance_held", "reference_held"):
         cell.wait(count, lambda c=count: cell.operator.value("calibrator", c) == samples)
@@ -64,12 +64,12 @@ def test_a_reference_over_dds_is_told_apart_and_can_be_the_input(cell, step_test
 
 def test_without_a_reference_it_cannot_be_the_input(cell, step_test):
     cell.processes.start("calibrator", output=str(cell.folder / "cal.json"))
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
     axes_to = cell.publisher("axes", AxisMessage)
     distance_to = cell.publisher("confocal", DistanceMessage)
     for axes, distance in blocks_of(step_test):
-        axes_to.publish(conversions.axis_message(messages, axes))
-        distance_to.publish(conversions.distance_message(messages, distance))
+        axes_to.publish(message_mapping.axis_message(messages, axes))
+        distance_to.publish(message_mapping.distance_message(messages, distance))
     samples = len(step_test.axes)
     cell.wait("all", lambda: cell.operator.value("calibrator", "distance_held") == samples)
     answer = cell.call(Identify, "calibrator/identify", input="reference")

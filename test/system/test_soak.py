@@ -16,9 +16,9 @@ from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from std_srvs.srv import Trigger
 from system.broken_wire import BrokenWire
 
-from omsm_ros.storage import bags
-from omsm_ros.storage.calibration_file import save_calibration
-from omsm_ros.storage.recording.bag_writer import BagWriter
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.cell import blocks_of
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(0)]

@@ -10,9 +10,9 @@ from omsm_msgs.msg import AxisBlock, DistanceBlock
 from std_srvs.srv import Trigger
 from system.broken_wire import BrokenWire
 
-from omsm_ros.emulators.players import emulated
-from omsm_ros.storage import conversions
-from omsm_ros.storage.calibration_file import save_calibration
+from omsm_ros.instruments.emulator_factory import emulated
+from omsm_ros.io import message_mapping
+from omsm_ros.io.calibration_file import save_calibration
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -47,12 +47,12 @@ def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
     cell.processes.start("corrector", calibration=str(path))
     until(cell, "corrector", STALE, "no sample of axes yet")
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
-    messages = conversions.ros_messages()
+    messages = message_mapping.ros_messages()
 
     def send(pair, period=None):
         made = (
-            conversions.axis_message(messages, pair[0]),
-            conversions.distance_message(messages, pair[1]),
+            message_mapping.axis_message(messages, pair[0]),
+            message_mapping.distance_message(messages, pair[1]),
         )
         for publisher, message in zip((axes, distance), made, strict=True):
             message.sample_period = period or message.sample_period

@@ -6,8 +6,8 @@ import yaml
 from omsm_msgs.msg import AccelerationBlock as AccelerationMessage
 from std_srvs.srv import Trigger
 
-from omsm_ros.core.samples.blocks import AccelerationBlock
-from omsm_ros.storage import bags, conversions
+from omsm_ros.core.streams.blocks import AccelerationBlock
+from omsm_ros.io import bags, message_mapping
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -49,13 +49,13 @@ def test_the_emulated_cells_vibration_is_measured_and_warned_of(cell):
 def test_the_alarm_ends_when_it_is_quiet(cell):
     cell.processes.start("vibration_monitor", alarm=20e-9, averages=1)
     publisher = cell.publisher("acceleration", AccelerationMessage)
-    messages, time, said = conversions.ros_messages(), np.arange(4000) / 4000.0, values(cell)
+    messages, time, said = message_mapping.ros_messages(), np.arange(4000) / 4000.0, values(cell)
     for k, size in enumerate((50e-9, 50e-9, 1e-9, 1e-9)):
         z = size * (2 * np.pi * 680) ** 2 * np.sin(2 * np.pi * 680 * time)
         block = AccelerationBlock(
             stamp_ns=0, first_sample=4000 * k, sample_period=2.5e-4, x=0 * z, y=0 * z, z=z
         )
-        publisher.publish(conversions.acceleration_message(messages, block))
+        publisher.publish(message_mapping.acceleration_message(messages, block))
     cell.wait("all samples", lambda: said("samples") == "16000")
     assert (said("alarms"), said("alarm")) == ("1", "False")
     cell.wait("that nothing comes is told", lambda: "no acceleration for" in said("message"))

@@ -5,18 +5,22 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from omsm_ros.core.machine.trajectories import Chirp
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.channels import Accelerometer, acceleration_of
-from omsm_ros.twin.clocks import ClockErrors
-from omsm_ros.twin.encoder import EncoderErrors, Pitch
-from omsm_ros.twin.hysteresis import backlash, friction
-from omsm_ros.twin.part_pose import PartPose
+from omsm_ros.twin.part import PartPose, Spokes
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Grid, Movement, Plant, move, respond
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import check_numbers, is_default
-from omsm_ros.twin.spokes import Spokes
-from omsm_ros.twin.structure import Creep, SoftMode, StructureErrors, deform, hardened
+from omsm_ros.twin.sensors import Accelerometer, ClockErrors, EncoderErrors, Pitch, acceleration_of
+from omsm_ros.twin.structure import (
+    Creep,
+    SoftMode,
+    StructureErrors,
+    backlash,
+    deform,
+    friction,
+    hardened,
+)
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.twin.vibration import Vibration, VibrationLine
 

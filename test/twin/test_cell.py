@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, blocks_of, record

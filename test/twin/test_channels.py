@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.aliasing import folded_frequency
-from omsm_ros.core.machine.trajectories import AxisPositions, Circle, StepTest
-from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle, StepTest
+from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, record
-from omsm_ros.twin.channels import Accelerometer, ReferenceSensor
 from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.sensors import Accelerometer, ReferenceSensor
 from omsm_ros.twin.vibration import VibrationLine
 
 SILENT = {"noise_m_per_s2": 0.0}

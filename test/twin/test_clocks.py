@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.machine.trajectories import AxisPositions
+from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
-from omsm_ros.twin.clocks import ClockErrors
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.probe import ProbeErrors
+from omsm_ros.twin.sensors import ClockErrors
 
 SPEED = 1e-3  # m/s along Z
 TURNING = 3.0  # rad/s

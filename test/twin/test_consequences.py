@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.kinematics import workpiece_xy
-from omsm_ros.core.machine.trajectories import AxisPositions, Spiral
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.aliasing import folded_frequency
-from omsm_ros.core.machine.kinematics import workpiece_xy
-from omsm_ros.core.machine.trajectories import AxisPositions, Spiral, StepTest
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral, StepTest
+from omsm_ros.core.ripple.density import folded_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.twin.cell import Recording, Truth
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.true_response import TrueResponse

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.machine.trajectories import AxisPositions, StepTest
+from omsm_ros.core.kinematics.trajectories import AxisPositions, StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.encoder import EncoderErrors, Pitch
+from omsm_ros.twin.sensors import EncoderErrors, Pitch
 
 QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0)
 

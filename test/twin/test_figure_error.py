@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.machine.kinematics import workpiece_xy
-from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.surface import deviation as form
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
-from omsm_ros.twin.figure_error import FigureError
+from omsm_ros.twin.part import FigureError
 
 RADIUS = PAPER_MIRROR_RADIUS_M
 

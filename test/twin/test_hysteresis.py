@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.twin.hysteresis import backlash, friction
+from omsm_ros.twin.structure import backlash, friction
 from omsm_ros.twin.trajectory import Trajectory
 
 

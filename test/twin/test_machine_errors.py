@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
-from omsm_ros.core.machine.trajectories import AxisPositions, Circle, Spiral
+from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle, Spiral
 from omsm_ros.core.surface.nominal import Flat, Sphere
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.aliasing import folded_frequency
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.trajectories import Spiral, StepTest
+from omsm_ros.core.kinematics.trajectories import Spiral, StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.ripple.density import folded_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant, respond
 
@@ -108,7 +108,7 @@ def test_680_hz_folds_to_320_hz():
 
 
 def test_chirp_of_figure_9():
-    from omsm_ros.core.machine.trajectories import Chirp
+    from omsm_ros.core.kinematics.trajectories import Chirp
 
     chirp, period = Chirp(), 1e-3
     assert (chirp.peak_to_peak, chirp.end_frequency, chirp.duration) == (40e-6, 15.0, 25.0)

@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.part_pose import PartPose, PosedSurface, posed
+from omsm_ros.twin.part import PartPose, PosedSurface, posed
 
 ALL_SIX = PartPose(
     x_m=5e-6, y_m=-3e-6, z_m=1e-6, tilt_x_rad=1e-3, tilt_y_rad=-2e-3, clocking_rad=0.3

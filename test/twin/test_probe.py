@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeErrors, ProbeRandom, Slope, read, slope_of

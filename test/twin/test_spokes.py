@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.spokes import Spokes
+from omsm_ros.twin.part import Spokes
 
 
 def test_waves_along_the_circle_have_their_length_and_size():

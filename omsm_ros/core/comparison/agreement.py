@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import chdtrc, ndtri
 
 from omsm_ros.core.comparison.matching import Matched
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
 
 # Of some 95 % (GUM 6.3.3).

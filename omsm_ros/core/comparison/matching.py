@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.readable import quantity

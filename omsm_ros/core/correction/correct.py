@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.correction.calibration_set import CalibrationSet
+from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.motion_filter import (
     MOVED,
     RATE,
@@ -23,34 +24,30 @@ from omsm_ros.core.correction.motion_filter import (
     MotionFilters,
     hidden_rows,
 )
-from omsm_ros.core.correction.scan_trace import ScanTrace
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
-from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
+from omsm_ros.core.correction.systematic import ScanPoints, ScanTrace, SystematicSource
 from omsm_ros.core.correction.uncertainty import (
     SCAN_SCATTER,
     ErrorSources,
     contributions,
     of_readings,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import latency_of
-from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
-from omsm_ros.core.machine.pitch_curve import PitchCurve
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.accounts import Account, Reason
-from omsm_ros.core.samples.blocks import (
+from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface, workpiece_points
+from omsm_ros.core.streams.blocks import (
     SAME_PERIOD,
+    Account,
     AxisBlock,
     Block,
     BoolArray,
     DistanceBlock,
     FloatArray,
+    Reason,
+    joined,
 )
-from omsm_ros.core.samples.continuity import Arrival
-from omsm_ros.core.samples.merging import joined
-from omsm_ros.core.samples.pairing import Intake, Pairing, Run
-from omsm_ros.core.samples.scatter import RunningScatter
-from omsm_ros.core.samples.slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
+from omsm_ros.core.streams.continuity import Arrival
+from omsm_ros.core.streams.pairing import Intake, Pairing, Run
+from omsm_ros.core.streams.statistics import RunningScatter
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S

@@ -10,17 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
-from omsm_ros.core.correction.calibration_set import CalibrationSet
+from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
-from omsm_ros.core.correction.uncertainty import (
-    SCAN_SCATTER,
-    ErrorSources,
-    uncertain_parts,
-)
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import latency_of
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, uncertain_parts
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import UNCERTAINTY, shown
 

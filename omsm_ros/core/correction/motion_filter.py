@@ -13,20 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import polynomial
 
-from omsm_ros.core.correction.calibration_set import CalibrationSet
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.uncertainty import (
     derivative_filter,
     past_of,
     sensitivity_filters,
     uncertain_parts,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
-from omsm_ros.core.dynamics.recursion import START_SAMPLES, Recursion, past_motion
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.accounts import Reason
-from omsm_ros.core.samples.blocks import BoolArray, CountingOn, FloatArray
-from omsm_ros.core.samples.pairing import Run
+from omsm_ros.core.lti.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
+from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, past_motion
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import BoolArray, CountingOn, FloatArray, Reason
+from omsm_ros.core.streams.pairing import Run
 
 # The share of a wrong start that may be left in the first published point.
 SETTLED = 1e-6

@@ -12,12 +12,269 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.core.correction import sensitivities as of
-from omsm_ros.core.correction.sensitivities import Parameters
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import Quantity
+
+# In which independent ways may a curve vary of which only size and smoothness are known?
+#
+# Drift over time, straightness over a slide's travel, pitch over Z: nobody knows the curve, but its
+# standard deviation and how far it is correlated. By Karhunen and Loève such a curve is a sum of
+# independent components, the eigenvectors of its covariance; few of them carry nearly all of it.
+
+Kernel = Callable[[FloatArray, FloatArray], FloatArray]
+
+# Between the nodes the components are interpolated; the last of those kept has a few nodes a wave.
+_NODES = 128
+# What the components left out would add to a standard deviation: half of this, 0.5 %.
+_LEFT_OUT = 0.01
+
+
+def random_walk(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the covariance of a walk of unit variance after one unit, zero at zero."""
+    return np.minimum(start, end)
+
+
+def fading(length: float) -> Kernel:
+    """Return the covariance of a curve of unit variance that forgets itself over ``length``."""
+    return lambda start, end: np.exp(-np.abs(start - end) / length)
+
+
+def smooth(length: float) -> Kernel:
+    """Return the covariance of a smooth curve of unit variance, correlated over ``length``."""
+    return lambda start, end: np.exp(-0.5 * ((start - end) / length) ** 2)
+
+
+def components(kernel: Kernel, where: FloatArray) -> FloatArray:
+    """Return independent components of unit variance (k, n) of a curve at ``where`` (n,).
+
+    Their squares add up to the variance of the curve, less a hundredth at most.
+    """
+    first, last = float(np.min(where)), float(np.max(where))
+    if last == first:
+        size = float(np.sqrt(kernel(where[:1], where[:1])[0]))
+        return np.full((1, len(where)), size)
+    nodes = np.linspace(first, last, _NODES)
+    values, vectors = np.linalg.eigh(kernel(nodes[:, np.newaxis], nodes[np.newaxis]))
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    share = np.cumsum(values) / max(float(values.sum()), np.finfo(np.float64).tiny)
+    kept = min(int(np.searchsorted(share, 1 - _LEFT_OUT)) + 1, _NODES)
+    return np.stack(
+        [
+            np.interp(where, nodes, np.sqrt(value) * vector)
+            for value, vector in zip(values[:kept], vectors.T[:kept], strict=True)
+        ]
+    )
+
+
+# What does each systematic error do to the heights of a scan, per unit of it?
+#
+# Each function returns the changes of the heights [m] of n points per unit of the error, (k, n) for
+# its k independent components, (n,) for one. Those that shift points laterally need their slopes.
+
+Parameters = Mapping[str, float]
+
+
+def tilt(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return tilts about y and about x; that a point also goes sideways is a hundredth."""
+    return np.stack([-p.x, p.y])
+
+
+def decentre(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the shift of the part along x and along y."""
+    one, zero = np.ones(len(p)), np.zeros(len(p))
+    return np.stack([p.sideways(one, zero), p.sideways(zero, one)])
+
+
+def clocking(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the turn of the part about the spindle."""
+    return p.sideways(-p.y, p.x)
+
+
+def expansion(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the growth of the part in all directions."""
+    return p.height + p.sideways(p.x, p.y)
+
+
+def _across(p: ScanPoints, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return what a shift by x, y [m] of the machine's frame does to the heights."""
+    return p.sideways(*workpiece_xy(x, y, p.c))
+
+
+def centre_x(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the shift of the zero of X."""
+    return _across(p, np.ones(len(p)), np.zeros(len(p)))
+
+
+def centre_y(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the shift of the zero of Y."""
+    return _across(p, np.zeros(len(p)), np.ones(len(p)))
+
+
+def beam(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the lean of the beam along X and along Y: a shift by the distance."""
+    zero = np.zeros(len(p))
+    return np.stack([_across(p, p.distance, zero), _across(p, zero, p.distance)])
+
+
+def squareness(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the angle of X to the plane of the spindle: a cone."""
+    return p.slide_x
+
+
+def parallelism(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the angle of Z to the spindle, in X and in Y: a shift by Z."""
+    zero = np.zeros(len(p))
+    return np.stack([_across(p, p.z, zero), _across(p, zero, p.z)])
+
+
+def straightness_x(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return an unknown curve over X, towards the probe."""
+    return _unknown_over(p.slide_x, parameters)
+
+
+def straightness_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return an unknown curve over Z, along X."""
+    zero = np.zeros(len(p))
+    return np.stack([_across(p, bow, zero) for bow in _unknown_over(p.z, parameters)])
+
+
+def _unknown_over(position: FloatArray, parameters: Parameters) -> FloatArray:
+    """Return components of a curve over ``position`` (n,), smooth over half of it by default."""
+    length = parameters.get("correlation_length", float(np.ptp(position)) / 2)
+    return components(smooth(length), position)
+
+
+def _turning(p: ScanPoints, parameters: Parameters) -> tuple[FloatArray, FloatArray]:
+    angle = parameters["per_turn"] * p.c
+    return np.cos(angle), np.sin(angle)
+
+
+def spindle_axial(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return both phases of a wave of the height over the turn."""
+    return np.stack(_turning(p, parameters))
+
+
+def spindle_radial(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return both phases of a turning shift."""
+    along, across = _turning(p, parameters)
+    return np.stack([_across(p, along, across), _across(p, -across, along)])
+
+
+def spindle_tilt(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return both phases of a turning tilt."""
+    along, across = _turning(p, parameters)
+    return np.stack(
+        [p.slide_x * along + p.slide_y * across, p.slide_y * along - p.slide_x * across]
+    )
+
+
+def encoder_scale(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the stretch of Z."""
+    return p.z
+
+
+def encoder_interpolation(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return both phases of a wave over Z."""
+    return _periodic(p.z, parameters["period"])
+
+
+def pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return an unknown angle over Z times the Abbe arm."""
+    return parameters["arm"] * _unknown_over(p.z, parameters)
+
+
+def backlash(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the direction in which Z moves."""
+    return np.sign(p.z_rate)
+
+
+def static_gain(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return the stretch of the distance."""
+    return -p.distance / parameters["gain"]
+
+
+def lateral_lag(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the rate of Z: late points lie further along the path."""
+    return p.z_rate
+
+
+def dynamics(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the directions of the covariance that are of noise."""
+    return _rows_or_none(p.dynamics[~p.hidden], p)
+
+
+def could_hide(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return those that are of what the step test could not show."""
+    return _rows_or_none(p.dynamics[p.hidden], p)
+
+
+def _rows_or_none(rows: FloatArray, p: ScanPoints) -> FloatArray:
+    return rows if len(rows) else np.zeros((1, len(p)))
+
+
+def linearity(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return the cube of the distance, one at the end of the range."""
+    return np.asarray((p.distance / parameters["half_range"]) ** 3, np.float64)
+
+
+def linearity_periodic(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return both phases of a wave over the distance."""
+    return _periodic(p.distance, parameters["period"])
+
+
+def _periodic(position: FloatArray, period: float) -> FloatArray:
+    angle = 2 * np.pi / period * position
+    return np.stack([np.cos(angle), np.sin(angle)])
+
+
+def slope(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the slope both ways, for nobody knows in which one a beam is tilted."""
+    one, zero = np.ones(len(p)), np.zeros(len(p))
+    return np.stack([_across(p, one, zero), _across(p, zero, one)])
+
+
+def slope_square(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the square of the slope."""
+    one, zero = np.ones(len(p)), np.zeros(len(p))
+    return np.asarray(p.sideways(one, zero) ** 2 + p.sideways(zero, one) ** 2, np.float64)
+
+
+def drift_rate(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the time."""
+    return p.time
+
+
+def drift_walk(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return an unknown walk over time."""
+    return components(random_walk, p.time)
+
+
+def drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return an unknown curve over time that fades."""
+    return components(fading(parameters["correlation_time"]), p.time)
+
+
+def of_a_walk(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the sum of squares of a walk."""
+    return p.time
+
+
+def of_a_curve(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the sum of squares of an unknown curve."""
+    return np.ones(len(p))
+
+
+def of_a_lateral_curve(p: ScanPoints, _: Parameters) -> FloatArray:
+    """Return the sum of squares of an unknown curve along X."""
+    return np.asarray(_across(p, np.ones(len(p)), np.zeros(len(p))) ** 2, np.float64)
+
+
+def of_pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return the sum of squares of an unknown pitch."""
+    return np.full(len(p), parameters["arm"] ** 2)
 
 
 @dataclass(frozen=True)
@@ -79,98 +336,96 @@ _CORRELATED = {"correlation_length": quantities.PERIOD}
 _LENGTH_OPTIONAL = ("correlation_length",)
 
 KINDS: dict[str, SourceKind] = {
-    "dynamics": SourceKind("noise of the step test", _SHARE, of.dynamics),
-    "could_hide": SourceKind("what the step test could not show", _SHARE, of.could_hide),
+    "dynamics": SourceKind("noise of the step test", _SHARE, dynamics),
+    "could_hide": SourceKind("what the step test could not show", _SHARE, could_hide),
     "static_gain": SourceKind(
-        "static gain of the probe", _SHARE, of.static_gain, {"gain": quantities.GAIN}
+        "static gain of the probe", _SHARE, static_gain, {"gain": quantities.GAIN}
     ),
-    "lateral_lag": SourceKind("latency that X and C do not share", _SECONDS, of.lateral_lag),
-    "lag_change": SourceKind("lag of Z since the step test", _SECONDS, of.lateral_lag),
-    "motion_error": SourceKind("half the backlash of Z", _METRES, of.backlash),
-    "tilt": SourceKind("tilt of the part, each way", _RADIANS, of.tilt),
-    "decentre": SourceKind("shift of the part, each way", _METRES, of.decentre, needs_slope=True),
-    "clocking": SourceKind("turn of the part", _RADIANS, of.clocking, needs_slope=True),
-    "expansion": SourceKind("thermal strain of the part", _SHARE, of.expansion, needs_slope=True),
-    "centre_x": SourceKind("zero of X at the spindle", _METRES, of.centre_x, needs_slope=True),
-    "centre_y": SourceKind("zero of Y at the spindle", _METRES, of.centre_y, needs_slope=True),
-    "beam": SourceKind("slope of the beam, each way", _SHARE, of.beam, needs_slope=True),
-    "squareness": SourceKind("angle of X to the spindle's plane", _RADIANS, of.squareness),
+    "lateral_lag": SourceKind("latency that X and C do not share", _SECONDS, lateral_lag),
+    "lag_change": SourceKind("lag of Z since the step test", _SECONDS, lateral_lag),
+    "motion_error": SourceKind("half the backlash of Z", _METRES, backlash),
+    "tilt": SourceKind("tilt of the part, each way", _RADIANS, tilt),
+    "decentre": SourceKind("shift of the part, each way", _METRES, decentre, needs_slope=True),
+    "clocking": SourceKind("turn of the part", _RADIANS, clocking, needs_slope=True),
+    "expansion": SourceKind("thermal strain of the part", _SHARE, expansion, needs_slope=True),
+    "centre_x": SourceKind("zero of X at the spindle", _METRES, centre_x, needs_slope=True),
+    "centre_y": SourceKind("zero of Y at the spindle", _METRES, centre_y, needs_slope=True),
+    "beam": SourceKind("slope of the beam, each way", _SHARE, beam, needs_slope=True),
+    "squareness": SourceKind("angle of X to the spindle's plane", _RADIANS, squareness),
     "parallelism": SourceKind(
-        "angle of Z to the spindle, each way", _RADIANS, of.parallelism, needs_slope=True
+        "angle of Z to the spindle, each way", _RADIANS, parallelism, needs_slope=True
     ),
     "straightness_x": SourceKind(
         "straightness of X towards the probe",
         _METRES,
-        of.straightness_x,
+        straightness_x,
         _CORRELATED,
         _LENGTH_OPTIONAL,
-        squares=of.of_a_curve,
+        squares=of_a_curve,
     ),
     "straightness_z": SourceKind(
         "straightness of Z, sideways",
         _METRES,
-        of.straightness_z,
+        straightness_z,
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,
-        squares=of.of_a_lateral_curve,
+        squares=of_a_lateral_curve,
     ),
     "pitch": SourceKind(
         "pitch of Z, over the Abbe arm",
         _RADIANS,
-        of.pitch,
+        pitch,
         {"arm": quantities.LENGTH, **_CORRELATED},
         _LENGTH_OPTIONAL,
-        squares=of.of_pitch,
+        squares=of_pitch,
     ),
     "spindle_axial": SourceKind(
-        "axial motion in step with the spindle", _METRES, of.spindle_axial, _PER_TURN
+        "axial motion in step with the spindle", _METRES, spindle_axial, _PER_TURN
     ),
     "spindle_radial": SourceKind(
         "radial motion in step with the spindle",
         _METRES,
-        of.spindle_radial,
+        spindle_radial,
         _PER_TURN,
         needs_slope=True,
     ),
-    "spindle_tilt": SourceKind(
-        "tilt in step with the spindle", _RADIANS, of.spindle_tilt, _PER_TURN
-    ),
-    "encoder_scale": SourceKind("scale of the Z encoder", _SHARE, of.encoder_scale),
+    "spindle_tilt": SourceKind("tilt in step with the spindle", _RADIANS, spindle_tilt, _PER_TURN),
+    "encoder_scale": SourceKind("scale of the Z encoder", _SHARE, encoder_scale),
     "encoder_interpolation": SourceKind(
-        "interpolation of the Z encoder", _METRES, of.encoder_interpolation, _PERIOD
+        "interpolation of the Z encoder", _METRES, encoder_interpolation, _PERIOD
     ),
     "probe_linearity": SourceKind(
         "cubic error of the probe at the end of its range",
         _METRES,
-        of.linearity,
+        linearity,
         {"half_range": quantities.PERIOD},
     ),
     "probe_periodic": SourceKind(
-        "periodic error of the probe", _METRES, of.linearity_periodic, _PERIOD
+        "periodic error of the probe", _METRES, linearity_periodic, _PERIOD
     ),
     "probe_slope": SourceKind(
         "error of the probe by the slope, each way",
         quantities.SLOPE_ERROR,
-        of.slope,
+        slope,
         needs_slope=True,
     ),
     "probe_slope_square": SourceKind(
         "error of the probe by the square of the slope",
         quantities.SLOPE_ERROR,
-        of.slope_square,
+        slope_square,
         needs_slope=True,
     ),
-    "drift_rate": SourceKind("steady drift", quantities.RATE_UNCERTAINTY, of.drift_rate),
+    "drift_rate": SourceKind("steady drift", quantities.RATE_UNCERTAINTY, drift_rate),
     "drift_walk": SourceKind(
-        "drift as a random walk", quantities.WALK_UNCERTAINTY, of.drift_walk, squares=of.of_a_walk
+        "drift as a random walk", quantities.WALK_UNCERTAINTY, drift_walk, squares=of_a_walk
     ),
     "drift": SourceKind(
         "drift that fades",
         _METRES,
-        of.drift,
+        drift,
         {"correlation_time": quantities.CORRELATION_TIME},
-        squares=of.of_a_curve,
+        squares=of_a_curve,
     ),
 }
 """Kinds of systematic error by their names."""

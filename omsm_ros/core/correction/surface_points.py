@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -9,15 +9,20 @@ sources, and the independent components of one source, add in squares (GUM, 5.1)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from omsm_ros.core.machine.kinematics import workpiece_xy
-from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
+from omsm_ros.core.kinematics.kinematics import (
+    Surface,
+    WorkpiecePoints,
+    slopes_by_differences,
+    workpiece_xy,
+)
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.quantities import MAP_SPACING
 
@@ -163,3 +168,180 @@ def _polynomial_slopes(
         if j:
             slope_y += value * j * u[:, i - j] * v[:, j - 1]
     return slope_x, slope_y
+
+
+# What do the systematic errors of a scan do to each of its points, however many there are?
+#
+# Sensitivity fields are had at some points, evenly chosen; between them they are interpolated in
+# the
+# order of the scan. Components that hardly count are left out, so that a figure of the heights is
+# propagated through a few fields, not through hundreds.
+
+# Of the variance of one source: half a hundredth of its standard uncertainty. Of that of all: a
+# figure may look where the largest ones do nothing, so a five-hundredth of a standard uncertainty.
+_LEFT_OUT_OF_ONE, _LEFT_OUT_OF_ALL = 1e-2, 4e-6
+# Sources of the calibration: in every scan that it corrects, each of their directions has one size.
+_OF_THE_CALIBRATION = ("dynamics", "could_hide", "lateral_lag", "static_gain")
+# With fewer points a turn what repeats twice in it would be cut off between them.
+_LEAST_POINTS_PER_TURN = 12
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFields:
+    """Independent systematic errors of a scan.
+
+    names: of the source of each, (s,);  every: of how many points of the scan one is here
+    fields: change of the heights [m] per standard uncertainty, (s, m)
+    bounds: names of the sources of which only an upper bound is known
+    aligned: names of the sources whose fields are, in this order, those of the same errors in
+        every scan with the same calibration
+    """
+
+    names: tuple[str, ...]
+    fields: FloatArray
+    every: int
+    bounds: tuple[str, ...] = ()
+    aligned: tuple[str, ...] = ()
+
+    def at(self, first: int, count: int) -> FloatArray:
+        """Return the fields (s, count) [m] at the scan's points from ``first`` on."""
+        if not self.fields.size:
+            return np.zeros((len(self.names), count))
+        last = self.fields.shape[1] - 1
+        place = np.minimum((first + np.arange(count)) / self.every, last)
+        below = np.minimum(place.astype(np.int64), max(last - 1, 0))
+        share = place - below
+        above = np.minimum(below + 1, last)
+        return np.asarray(
+            self.fields[:, below] * (1 - share) + self.fields[:, above] * share, np.float64
+        )
+
+
+def scan_fields(
+    fields: Mapping[str, FloatArray], every: int, bounds: Collection[str] = ()
+) -> ScanFields:
+    """Return the components that count of ``fields``, by source (k, m) [m].
+
+    bounds: names of the sources of which only an upper bound is known
+    """
+    names: list[str] = []
+    rows: list[FloatArray] = []
+    aligned = tuple(name for name in _OF_THE_CALIBRATION if name in fields)
+    for name, found in fields.items():
+        own = found if name in aligned else _principal(found)
+        names += [name] * len(own)
+        rows += list(own)
+    if not rows:
+        return ScanFields((), np.empty((0, 0)), every)
+    counts = _count(np.array(rows), _LEFT_OUT_OF_ALL)
+    # To be found again in another scan, they stay together.
+    together = {name for name, own in zip(names, counts, strict=True) if own and name in aligned}
+    kept = np.flatnonzero(counts | np.isin(names, list(together)))
+    left = tuple(names[k] for k in kept)
+    known = tuple(name for name in bounds if name in left)
+    same = tuple(name for name in aligned if name in together)
+    return ScanFields(left, np.array([rows[k] for k in kept]), every, known, same)
+
+
+def resolves_turns(points: ScanPoints) -> bool:
+    """Return whether ``points`` are close enough for what repeats with the spindle's turns."""
+    # An angle that is wrapped jumps by a turn once a turn.
+    steps = np.abs(np.diff(np.unwrap(points.c)))
+    return not len(steps) or float(np.median(steps)) <= 2 * np.pi / _LEAST_POINTS_PER_TURN
+
+
+def _principal(fields: FloatArray) -> FloatArray:
+    """Return uncorrelated rows whose squares add up as those of ``fields``, but for small ones."""
+    moved = fields - np.mean(fields, axis=1, keepdims=True)
+    rows = np.linalg.eigh(moved @ moved.T)[1].T @ fields
+    return np.asarray(rows[_count(rows, _LEFT_OUT_OF_ONE)], np.float64)
+
+
+def _count(rows: FloatArray, left_out: float) -> BoolArray:
+    """Return which ``rows`` (k, n) make up all but the share ``left_out`` of their variance."""
+    own = np.var(rows, axis=1)
+    order = np.argsort(own)
+    small = order[np.cumsum(own[order]) <= left_out * own.sum()]
+    counts = np.ones(len(rows), bool)
+    counts[small] = False
+    return counts
+
+
+# Which points stand for a whole scan where its systematic errors are judged?
+#
+# Sensitivity fields are smooth over a scan: a few thousand points, evenly chosen in time, show what
+# millions would, in memory that does not grow.
+
+# Sixteen points a turn of the paper's scan and more: enough for what repeats eight times a turn.
+MOST_TRACED = 8192
+
+_COLUMNS = ("time", "x", "y", "height", "z", "z_rate", "c", "distance")
+
+
+class ScanTrace:
+    """Points of a scan, evenly chosen while they pass; time and Z count from the first one.
+
+    seen: points that passed
+    hidden: which changes by the covariance are of what the step test could not show, (r,)
+    """
+
+    def __init__(self, most: int = MOST_TRACED) -> None:
+        self._kept = EvenSelection(most)
+        self._session: int | None = None
+        self._late = self._last = 0.0
+        self._first_z = 0.0
+        self.hidden: BoolArray = np.zeros(0, np.bool_)
+        self.seen = 0
+
+    def add(
+        self,
+        session: int,
+        time: FloatArray,
+        where: WorkpiecePoints,
+        c: FloatArray,
+        motion: FloatArray,
+        distance: FloatArray,
+    ) -> ScanPoints:
+        """Take in the next points, each array (n,), and return them as fields look at them.
+
+        session, time: of the trigger's counter, by which the samples are counted [s]; what comes
+            after a restart of the counter is taken to follow at once
+        motion: H(z), its rate, and its change by each direction of the covariance, (2 + r, n)
+        """
+        if len(time):
+            if session != self._session:
+                self._session, self._late = session, self._last - float(time[0])
+            self._last = float(time[-1]) + self._late
+            if not self.seen:
+                self._first_z = float(motion[0, 0])
+        points = ScanPoints(
+            time=time + self._late,
+            x=where.x,
+            y=where.y,
+            height=where.height,
+            z=motion[0] - self._first_z,
+            z_rate=motion[1],
+            c=c,
+            distance=distance,
+            dynamics=motion[2:],
+            hidden=self.hidden,
+        )
+        self._keep(points)
+        return points
+
+    @property
+    def every(self) -> int:
+        """Of how many points one is kept."""
+        return self._kept.every
+
+    def _keep(self, points: ScanPoints) -> None:
+        self.seen += len(points)
+        chosen = self._kept.chosen(len(points))
+        rows = [getattr(points, name)[chosen] for name in _COLUMNS]
+        self._kept.add_chosen(np.stack([*rows, *points.dynamics[:, chosen]]).T, len(points))
+
+    def points(self) -> ScanPoints:
+        """Return those kept, in the order of time."""
+        rows = self._kept.rows() if self.seen else np.empty((0, len(_COLUMNS)))
+        columns = dict(zip(_COLUMNS, rows.T, strict=False))
+        return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :], hidden=self.hidden)

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import polynomial
 
+from omsm_ros.core.calibration.calibration import Calibration, latency_of
 from omsm_ros.core.correction.surface_points import SurfacePoints
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import DigitalFilter, bilinear, discretise
-from omsm_ros.core.dynamics.latency import latency_of
-from omsm_ros.core.dynamics.recursion import past_motion, past_rest
-from omsm_ros.core.dynamics.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.machine.surface_height import Surface, slopes_by_differences
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
+from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
+from omsm_ros.core.lti.recursion import past_motion, past_rest
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,

@@ -3,46 +3,155 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.form.cells import Cells
-from omsm_ros.core.form.figures import (
+from omsm_ros.core.form.deviation_map import (
+    Cells,
     DeviationMap,
     Figure,
     noise_beside,
     root_mean_square,
 )
-from omsm_ros.core.form.open_place import with_open_place
-from omsm_ros.core.form.optical_terms import optical_terms
-from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
-from omsm_ros.core.form.power_density import Curve, PowerDensity, power_density
-from omsm_ros.core.form.profiles import profiles
-from omsm_ros.core.form.removal import best_fit, without_form, without_second_order
+from omsm_ros.core.form.part_figures import (
+    POWER,
+    SYMMETRIC,
+    asymmetric,
+    best_fit,
+    extents_of_part,
+    rms_of_part,
+    without_form,
+    without_power,
+    without_second_order,
+    without_tilt,
+)
 from omsm_ros.core.form.texture import (
     Bands,
+    Curve,
+    PowerDensity,
     bands_of,
+    power_density,
+    profiles,
     slopes_without_second_order,
     texture,
 )
+from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.registration.placement import (
-    Aperture,
-    Placed,
-    Portion,
-    Portions,
-    placed,
-)
-from omsm_ros.core.registration.pose_budget import Registration
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.registration.degrees_of_freedom import Registration
+from omsm_ros.core.registration.placement import Aperture, Placed, Portion, Portions, placed
 from omsm_ros.core.registration.register import CHUNK, register
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.samples.even_selection import EvenSelection
-from omsm_ros.core.samples.scatter import noise_of
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.zernike_terms import first_terms
+from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_slopes, zernike_values
 from omsm_ros.errors import DataError
+
+# Where on the part do its terms lie, if points tell badly how it was turned or shifted?
+#
+# A sphere may be moved along itself, and its form goes along: terms in the frame that was found are
+# those of the part in its own only as far as such a move changes them. The same holds for a part
+# whose pose is known to tenths of a millimetre.
+
+# Polynomials less one order, moved by millimetres: a hundred points for each term tell them.
+_MOST_POINTS = 4_000
+
+
+def with_open_place(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
+    """Return the fit with what the open place of the part may do to its terms.
+
+    Of each freedom that no points determine, and of each error of the pose beside what that does
+    to the deviations. In the first order: the slope of the smooth form times how far its places
+    would move.
+    """
+    few = map_.every(_MOST_POINTS)
+    slopes = (
+        fit.coefficients @ along / fit.disc.radius
+        for along in zernike_slopes(*fit.disc.scaled(few.x, few.y), fit.terms)
+    )
+    moves = np.concatenate([found.displaced(few.x, few.y), found.glides(few.x, few.y)])
+    changes = -np.einsum("rin,in->rn", moves, np.stack(list(slopes)))
+    made = fit_zernikes(
+        few.x, few.y, few.deviation, fit.terms, fit.disc, weights=few.area, effects=changes
+    )
+    if made.terms != fit.terms:
+        return fit
+    effects = made.effects
+    effects[:, : fit.effects.shape[1]] += fit.effects
+    return replace(fit, effects=effects)
+
+
+# The terms of ISO 10110-5 for the form of an optic, from its deviation along the normal.
+
+
+def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, Figure]:
+    """Return sagitta deviation (A), irregularity (B), its symmetric part (C), and rms, each [m].
+
+    A is the extent over the disc of the power that fits best beside piston and tilts alone; B the
+    extent of what is left without them, over 99.5 % of the area; C that of the part of it that is
+    the same all around. RMSt is the rms without piston and tilts, RMSi without power too, and RMSa
+    that of what is not the same all around. Deviations of the surface, not of a wave that is
+    reflected by it.
+    """
+    irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
+    return {
+        "iso10110_A": _sagitta(map_, fit),
+        "iso10110_B": extents_of_part(irregular, fit.disc)[1],
+        "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[1],
+        "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
+        "iso10110_RMSi": rms_of_part(irregular),
+        "iso10110_RMSa": rms_of_part(uneven),
+    }
+
+
+def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the part of the irregularity that is the same all around.
+
+    It has no noise of single points: what they do to its few terms is in its effects.
+    """
+    of_noise = replace(map_, effects=np.concatenate([map_.effects, _shaken(map_, disc)]), noise=0.0)
+    irregular, uneven = without_power(of_noise, disc), asymmetric(of_noise, disc)
+    return replace(
+        irregular,
+        deviation=irregular.deviation - uneven.deviation,
+        effects=irregular.effects - uneven.effects,
+    )
+
+
+def _shaken(map_: DeviationMap, disc: Aperture) -> FloatArray:
+    """Return independent effects (k, n) [m] of the noise of points on the symmetric terms."""
+    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
+    weighted = columns * map_.area
+    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
+    covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T @ columns, np.float64)
+
+
+def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> Figure:
+    """Return twice the power that fits best beside piston and tilts, over the area.
+
+    On a whole disc that is the term of the fit. On a strip or a ring the terms of a fit share what
+    a sphere alone would take, and are extrapolated to where nobody measured. What the fit leaves
+    has no power, so that a sum of its terms is the power with all that is uncertain of it.
+    """
+    if Term(2, 0) not in fit.terms:
+        return Figure(None, None)
+    places = [fit.terms.index(term) for term in POWER]
+    gram, right = np.zeros((len(POWER), len(POWER))), np.zeros((len(POWER), len(fit.terms)))
+    for begin in range(0, len(map_), ZERNIKE_FIT_CHUNK):
+        chunk = slice(begin, begin + ZERNIKE_FIT_CHUNK)
+        columns = zernike_values(*fit.disc.scaled(map_.x[chunk], map_.y[chunk]), fit.terms)
+        chosen = columns[places] * map_.area[chunk]
+        right += chosen @ columns.T
+        gram += chosen @ columns[places].T
+    shares = np.linalg.solve(gram, right)[POWER.index(Term(2, 0))]
+    variance = shares @ fit.covariance @ shares + np.sum(np.square(shares @ fit.effects))
+    # Of heights that are metres off, rounding is all that is left of it.
+    uncertainty = float(2 * np.sqrt(variance)) if variance >= 0 else None
+    return Figure(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)
+
 
 ZERNIKES = first_terms(37, "fringe")
 # Twelve numbers each make 50 MB. Extremes and counts are of all points.

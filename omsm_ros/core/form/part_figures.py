@@ -23,14 +23,111 @@ uncertainty of the figure.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
 import numpy as np
 
-from omsm_ros.core.form.figures import DeviationMap, Figure, weighted_quantiles
-from omsm_ros.core.form.local_means import closest_means
+from omsm_ros.core.form.deviation_map import (
+    DeviationMap,
+    Figure,
+    gaussian_weights,
+    weighted_quantiles,
+)
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
+
+# Means of scattered values around each of their points, over the width that takes most noise.
+#
+# The Gaussian of ISO 16610 on a fine grid, between whose nodes points lie linearly. Kernels that
+# take less of short waves make more of what is at the rim, where parts are highest.
+
+_MOST_ACROSS = 256
+# Cutoffs in steps of the grid, each half a step of an octave wider than the one before.
+_CUTOFFS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+_SEED_LOCAL_MEANS = 11
+
+
+class Chosen(NamedTuple):
+    """The width whose means come closest to what is there without noise.
+
+    means: of its values (n,);  rest: share of the noise of a point in what they leave of it
+    error: expected mean square of ``means`` from that without noise
+    """
+
+    means: LocalMeans
+    rest: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMeans:
+    """Means around n points. Linear: those of a sum are the sum of those.
+
+    nodes, weights: of the four nodes of the grid around each point (4, n)
+    along_y, along_x: weights of the Gaussian (r, r), (c, c);  total: of the points at each node
+    """
+
+    nodes: IntArray
+    weights: FloatArray
+    along_y: FloatArray
+    along_x: FloatArray
+    total: FloatArray
+
+    @classmethod
+    def of(cls, x: FloatArray, y: FloatArray, cutoff: float) -> LocalMeans:
+        """Return those at x, y (n,) [m], of a ``cutoff`` in steps of about a point each."""
+        spans = float(np.ptp(x)), float(np.ptp(y))
+        longest = max(spans) or 1.0
+        step = max(float(np.sqrt(spans[0] * spans[1] / len(x))), longest / _MOST_ACROSS)
+        across, up = (x - x.min()) / step, (y - y.min()) / step
+        rows, columns = int(up.max()) + 2, int(across.max()) + 2
+        column, row = across.astype(np.int64), up.astype(np.int64)
+        right, above = across - column, up - row
+        corners = [(a, b) for a in (0, 1) for b in (0, 1)]
+        nodes = np.stack([(row + b) * columns + column + a for a, b in corners])
+        weights = np.stack(
+            [(right if a else 1 - right) * (above if b else 1 - above) for a, b in corners]
+        )
+        made = cls(
+            nodes,
+            weights,
+            gaussian_weights(rows, cutoff),
+            gaussian_weights(columns, cutoff),
+            np.ones((rows, columns)),
+        )
+        total = np.maximum(made._on_grid(np.ones(len(x))), np.finfo(np.float64).tiny)
+        return cls(nodes, weights, made.along_y, made.along_x, total)
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Return the means of ``values`` (n,)."""
+        means = (self._on_grid(values) / self.total).ravel()
+        return np.asarray(np.sum(self.weights * means[self.nodes], axis=0), np.float64)
+
+    def _on_grid(self, values: FloatArray) -> FloatArray:
+        size = self.total.size
+        sums = np.bincount(self.nodes.ravel(), (self.weights * values).ravel(), size)
+        return np.asarray(self.along_y @ sums.reshape(self.total.shape) @ self.along_x, np.float64)
+
+
+def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float) -> Chosen:
+    """Return the means whose expected error is least for ``values`` at x, y, each (n,).
+
+    The error is told by the values themselves (C. Stein's unbiased estimate), with the trace from
+    one draw of signs.
+    """
+    signs = np.random.default_rng(_SEED_LOCAL_MEANS).choice([-1.0, 1.0], size=len(x))
+    found = []
+    for cutoff in _CUTOFFS:
+        means = LocalMeans.of(x, y, cutoff)
+        left = float(np.mean((values - means(values)) ** 2))
+        kept = means(signs)
+        error = left - noise**2 * (1 - 2 * float(np.mean(signs * kept)))
+        found.append(Chosen(means, float(np.mean((signs - kept) ** 2)), error))
+    return min(found, key=lambda each: each.error)
+
 
 # 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST = (0.0025, 0.9975)
@@ -219,3 +316,69 @@ def _of_square(square: float, spread: float) -> Figure:
     high = float(np.sqrt(max(square + 2 * spread, spread)))
     low = float(np.sqrt(max(square - 2 * spread, 0.0)))
     return Figure(value, max(high - value, value - low) / 2)
+
+
+# Maps without some of their terms: what bending, focus or turning would take away.
+#
+# Removal is linear, so that what an error does to the map goes the same way as the map.
+
+# Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a
+# turned part has all around, to order 12.
+POWER = (Term(0, 0), Term(1, -1), Term(1, 1), Term(2, 0))
+_FORM = terms_up_to(4)
+SYMMETRIC = tuple(Term(n, 0) for n in range(4, 14, 2))
+
+
+def without(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
+    """Return the map without its area-weighted best sum of ``columns`` (k, n)."""
+    weighted = columns * map_.area
+    # Of points on a line some columns are the same; then the least solution serves.
+    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
+    values = np.concatenate([map_.deviation[np.newaxis], map_.effects])
+    rest = values - (solve @ (weighted @ values.T)).T @ columns
+    return replace(map_, deviation=rest[0], effects=rest[1:])
+
+
+def best_fit(map_: DeviationMap) -> DeviationMap:
+    """Return the map where the part sits as it fits best, in all that was fitted or held.
+
+    What no move of the part explains: however it sat, so much deviates. Form that looks like a move
+    is not in it, and neither is what the pose leaves open.
+    """
+    moves = map_.effects[map_.moves]
+    size = np.sqrt(np.mean(moves**2, axis=1))
+    return without(map_, moves[size > 0] / size[size > 0, np.newaxis])
+
+
+def without_second_order(map_: DeviationMap) -> DeviationMap:
+    """Return the map without its best ``Σ c_ij x^i y^j``, i + j ≤ 2."""
+    u, v = (_scaled(values) for values in (map_.x, map_.y))
+    return without(map_, np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]))
+
+
+def without_tilt(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map without piston and tilts."""
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER[:3]))
+
+
+def without_power(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map without piston, tilts and power: the irregularity of ISO 10110-5."""
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER))
+
+
+def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map without Zernike terms up to order 4: the F-operation of ISO 25178-2.
+
+    A Gaussian filter would leave them along the rim, where its window is cut off.
+    """
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
+
+
+def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map without power and without what is the same all around, up to order 12."""
+    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
+
+
+def _scaled(values: FloatArray) -> FloatArray:
+    low, high = float(values.min()), float(values.max())
+    return np.asarray((values - (low + high) / 2) / ((high - low) / 2 or 1.0), np.float64)

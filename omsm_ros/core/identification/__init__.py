@@ -1,1 +1,1 @@
-"""From a recording to a calibration: band, tests of the residual, verdict."""
+"""From a step test to a certified calibration."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from omsm_ros.core.dynamics.response_band import ResponseLimits
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.output_error import Fit
-from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.identification.departure_search import Searched
+from omsm_ros.core.estimation.output_error import Fit
+from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.identification.model_error_search import Searched
 from omsm_ros.core.identification.residual_tests import ResidualTests, residual_tests
 from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.lti.frequency_response import ResponseLimits
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.dynamics.frequency_response import FrequencyResponse, frequency_response
-from omsm_ros.core.fitting.output_error import Problem
-from omsm_ros.core.fitting.steps import Edge
+from omsm_ros.core.estimation.output_error import Problem
+from omsm_ros.core.estimation.steps import Edge
 from omsm_ros.core.identification.identify import Identification
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
+from omsm_ros.core.streams.blocks import FloatArray
 
 # Resolves 1 Hz; a step test has a few edges in each segment.
 _SEGMENT_S = 1.0

@@ -4,7 +4,7 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 
 | step | where |
 |---|---|
-| the record becomes a problem to fit | :mod:`omsm_ros.core.fitting.preparation` |
+| the record becomes a problem to fit | :mod:`omsm_ros.core.estimation.preparation` |
 | a model is chosen and fitted | :mod:`model_choice` |
 | what the residual shows besides is modelled | :mod:`departure_search` |
 | its covariance from noise | :mod:`response_uncertainty` |
@@ -15,32 +15,317 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import wraps
+from itertools import chain
 from typing import ParamSpec
 
 import numpy as np
 
-from omsm_ros.core.departures.families import DRIFT
-from omsm_ros.core.dynamics.calibration import RECORDED, Calibration
-from omsm_ros.core.dynamics.response_band import ResponseLimits
-from omsm_ros.core.fitting.axis_steps import check_axis_steps
-from omsm_ros.core.fitting.output_error import Fit
-from omsm_ros.core.fitting.preparation import Prepared, check_gain, prepare
-from omsm_ros.core.identification.certificate import certificate_of
+from omsm_ros.core.calibration.calibration import (
+    ACCEPTED,
+    ENTRY,
+    RECORDED,
+    REJECTED,
+    RESERVED,
+    Calibration,
+    unresolved,
+)
+from omsm_ros.core.calibration.finding import Finding
+from omsm_ros.core.estimation.model_order import Candidate
+from omsm_ros.core.estimation.output_error import Fit
+from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
+from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
-from omsm_ros.core.identification.consistency import consistency
-from omsm_ros.core.identification.covariance_terms import reference_delay
-from omsm_ros.core.identification.departure_search import search
+from omsm_ros.core.identification.covariance_terms import consistency, reference_delay
 from omsm_ros.core.identification.evidence import Evidence
-from omsm_ros.core.identification.finding import Finding
-from omsm_ros.core.identification.hidden_terms import hidden_covariance, other_modes
 from omsm_ros.core.identification.model_choice import Model, model_from_start
-from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
-from omsm_ros.core.identification.two_masses import table_mass
-from omsm_ros.core.samples.motion_record import MotionRecord
-from omsm_ros.errors import IdentificationError
+from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.identification.response_uncertainty import (
+    hidden_covariance,
+    no_surer,
+    other_modes,
+    response_uncertainty,
+)
+from omsm_ros.core.lti.frequency_response import ResponseLimits, low_frequency_delay_uncertainty
+from omsm_ros.core.lti.modes import (
+    FITTED,
+    TwoMassFit,
+    finite_values,
+    fit_two_mass,
+    modal_remainder,
+    mode_entries,
+    oscillations,
+    shape,
+)
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.families import DRIFT
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.motion_record import MotionRecord
+from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
+from omsm_ros.linear_algebra import unit_columns
+from omsm_ros.quantities import MASS
+from omsm_ros.readable import quantity
+
+# Is the identified response that of two masses? The entry ``two_mass`` of a certificate.
+
+# The setting without which masses, springs and dampers are known only per mass of the table.
+TABLE_MASS_SETTING = "table_mass_kg"
+# Evenly over the band; a covariance of seven coefficients has no more directions than that.
+_LINES = 40
+# Root of χ² per degree of freedom, of which there are one or two: beyond this, which chance
+# exceeds three times in a thousand at most, it is another machine.
+_GREATEST_MISFIT = 3.0
+# A mass known worse than this, relative, is not known; its stated uncertainty is linearised.
+_GREATEST_UNCERTAINTY = 0.5
+
+
+def table_mass(settings: Mapping[str, object]) -> float | None:
+    """Return the moving mass of the table [kg] among the settings, or None if it is not there.
+
+    Raises ConfigurationError unless it is the mass of a table.
+    """
+    value = settings.get(TABLE_MASS_SETTING)
+    if value is None:
+        return None
+    return float(MASS.checked(value, ConfigurationError, f"setting {TABLE_MASS_SETTING!r}"))
+
+
+def two_mass_entry(
+    dynamics: TransferFunction, covariance: FloatArray, up_to: float, mass: float | None
+) -> dict[str, object] | None:
+    """Return the two-mass model that agrees with ``dynamics`` to ``up_to`` [Hz]; None without one.
+
+    mass: of the table [kg]; None when it is not known: then m1 is 1, and the others are per
+        mass of the table
+
+    Eq. 7 is tried first (the probe on the second mass), then the driven mass itself.
+    """
+    if not up_to > 0 or len(oscillations(dynamics)) < 2:
+        return None
+    lines = np.linspace(up_to / _LINES, up_to, _LINES)
+    for collocated in (False, True):
+        fitted = fit_two_mass(
+            dynamics,
+            covariance,
+            table_mass=1.0 if mass is None else mass,
+            collocated=collocated,
+            frequencies=lines,
+        )
+        if _believable(fitted):
+            return {
+                TABLE_MASS_SETTING: mass,
+                "model": asdict(fitted.model),
+                "relative_uncertainty": dict(zip(FITTED, fitted.uncertainty.tolist(), strict=True)),
+                "misfit": fitted.misfit,
+                "collocated": collocated,
+            }
+    return None
+
+
+def _believable(fitted: TwoMassFit) -> bool:
+    known = bool(np.all(fitted.uncertainty < _GREATEST_UNCERTAINTY))
+    return fitted.misfit < _GREATEST_MISFIT and known
+
+
+# The static gain, attributed: is it the probe's scale, or the encoder's?
+#
+# Plain regressions on the plateaus; with a reference sensor on the same motion, three gains
+# of which two say who is wrong.
+
+# Rest after an edge that is not averaged, for the response to settle.
+_SETTLE_S = 0.1
+# Gain, drift and offset are three unknowns.
+_LEAST_PLATEAUS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """A ratio of travels [1] and its standard uncertainty."""
+
+    value: float
+    uncertainty: float
+
+
+@dataclass(frozen=True, slots=True)
+class StaticGains:
+    """Travel of one per travel of the other, magnitudes; None without a reference sensor."""
+
+    probe_per_encoder: Gain
+    probe_per_reference: Gain | None
+    reference_per_encoder: Gain | None
+
+
+def static_gains(record: MotionRecord) -> StaticGains:
+    """Return the gains from the means of the plateaus, offset and linear drift allowed for.
+
+    The uncertainty is that of the regression over plateaus, so it holds for whatever makes
+    them scatter: noise, backlash, slip. Raises StepTestError with fewer than four plateaus.
+    """
+    steps = find_steps(record.z, record.sample_period)
+    rests = _rests(steps.edges, len(record), round(_SETTLE_S / record.sample_period))
+    readings = np.where(record.ok, record.distance, np.nan)
+    time = _means(np.arange(len(record), dtype=np.float64), rests)
+    encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
+    if record.reference is None:
+        return StaticGains(_ratio(encoder, probe, time), None, None)
+    reference = _means(record.reference, rests)
+    return StaticGains(
+        _ratio(encoder, probe, time),
+        _ratio(reference, probe, time),
+        _ratio(encoder, reference, time),
+    )
+
+
+def _rests(edges: tuple[Edge, ...], samples: int, settle: int) -> list[tuple[int, int]]:
+    starts = [0, *(edge.stop + settle for edge in edges)]
+    stops = [*(edge.start for edge in edges), samples]
+    rests = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a >= 5]
+    if len(rests) < _LEAST_PLATEAUS:
+        raise StepTestError(
+            f"{len(rests)!r} plateaus of rest, at least {_LEAST_PLATEAUS} are needed for a gain; "
+            "make more steps or rest longer"
+        )
+    return rests
+
+
+def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
+    means = [
+        float(np.mean(part[np.isfinite(part)])) if np.any(np.isfinite(part)) else np.nan
+        for part in (values[a:b] for a, b in rests)
+    ]
+    return np.asarray(means)
+
+
+def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
+    known = np.isfinite(travel) & np.isfinite(other)
+    if np.sum(known) < _LEAST_PLATEAUS:
+        raise StepTestError(
+            f"{int(np.sum(known))!r} plateaus with readings, at least {_LEAST_PLATEAUS} are needed"
+        )
+    x, t, y = travel[known], time[known], other[known]
+    columns = np.column_stack([x - x.mean(), t / t[-1], np.ones(len(x))])
+    unit, scale = unit_columns(columns)
+    inverse = np.linalg.pinv(unit)
+    solved = inverse @ y
+    residual = y - unit @ solved
+    variance = float(residual @ residual) / max(len(y) - 3, 1)
+    uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
+    return Gain(float(abs(solved[0]) / scale[0]), float(uncertainty))
+
+
+# The certificate of a calibration: how it was obtained, and whether to trust it.
+
+
+def certificate_of(
+    evidence: Evidence, findings: Sequence[Finding], table_mass: float | None
+) -> dict[str, object]:
+    """Return a dict of JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
+
+    table_mass: moving mass of the table [kg], None if it is not known
+    """
+    known, valid_from = evidence.known, 1 / (2 * np.pi * evidence.searched.survey.slowest_creep)
+    limits = dict(chain.from_iterable(finding.limits.items() for finding in findings))
+    entries = dict(chain.from_iterable(finding.entries.items() for finding in findings))
+    reasons = list(chain.from_iterable(finding.reasons for finding in findings))
+    warnings = list(chain.from_iterable(finding.warnings for finding in findings))
+    reservations = list(chain.from_iterable(finding.reservations for finding in findings))
+    return {
+        **_order_entries(evidence.model),
+        **_residual_entries(evidence),
+        **_response_entries(evidence),
+        **_gain_entries(evidence),
+        "two_mass": two_mass_entry(
+            evidence.dynamics, evidence.known.covariance, evidence.known.valid_up_to, table_mass
+        ),
+        **entries,
+        "valid_from": valid_from,
+        "limits": limits,
+        "warnings": warnings,
+        "reasons": reasons,
+        "reservations": reservations,
+        "verdict": verdict(reasons, reservations, valid_from, known.valid_up_to),
+    }
+
+
+def verdict(
+    reasons: Sequence[str], reservations: Sequence[str], valid_from: float, valid_up_to: float
+) -> str:
+    """Return "rejected", or "accepted" and the band [Hz] that the data support.
+
+    reservations: what was found in the data and is held by a wider band
+    """
+    if reasons:
+        return REJECTED
+    kept = RESERVED if reservations else ACCEPTED
+    low, high = quantity(valid_from, "Hz", 2), quantity(valid_up_to, "Hz")
+    return f"{kept}, supported by data from {low} to {high}"
+
+
+def _order_entries(model: Model) -> dict[str, object]:
+    return {
+        "order": model.chosen.fit.structure.poles,
+        "structure": _structure(model.chosen),
+        "candidates": [
+            _structure(c) | {"bic": c.bic, "rms_m": c.fit.rms} for c in model.candidates
+        ],
+    }
+
+
+def _structure(candidate: Candidate) -> dict[str, object]:
+    structure = candidate.fit.structure
+    return {"poles": structure.poles, "zeros": structure.zeros, "delay": structure.delay}
+
+
+def _residual_entries(evidence: Evidence) -> dict[str, object]:
+    prepared, tests = evidence.prepared, evidence.residual
+    compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
+    compared |= {"axis_spikes": prepared.axis_spikes} if prepared.axis_spikes else {}
+    return {
+        "noise_covariance": evidence.known.from_noise.ravel().tolist(),
+        "residual_rms_m": evidence.fit.rms,
+        "edges": len(prepared.steps.edges),
+        "whiteness_p": tests.whiteness,
+        "samples": dict(evidence.record.counts) | compared,
+    }
+
+
+def _response_entries(evidence: Evidence) -> dict[str, object]:
+    dynamics, known = evidence.dynamics, evidence.known
+    return {
+        ENTRY: unresolved(dynamics.low_frequency_delay).entry(),
+        "low_frequency_delay_s": dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty_s": low_frequency_delay_uncertainty(
+            dynamics, known.covariance
+        ),
+        "shown_up_to_hz": known.shown_up_to,
+        "shape": finite_values(shape(dynamics, 0.5 / evidence.prepared.problem.period)),
+        "modes": mode_entries(dynamics, known.covariance),
+        "modal_remainder": modal_remainder(dynamics, known.valid_up_to),
+    }
+
+
+def _gain_entries(evidence: Evidence) -> dict[str, object]:
+    """Return what the fit finds beside the response: gain and drift."""
+    best = evidence.fit
+    duration = len(evidence.record) * evidence.record.sample_period
+    return {
+        "static_gain": abs(best.gain),
+        "static_gain_uncertainty": float(np.sqrt(evidence.known.gain_variance)),
+        "static_gains": _attributed(evidence.record),
+        "polarity": -int(np.sign(best.gain)),
+        "drift_m_s": 2 * float(best.background[1]) / duration,
+    }
+
+
+def _attributed(record: MotionRecord) -> dict[str, object] | None:
+    """Return gains between probe, encoder and reference; None where there are too few plateaus."""
+    try:
+        return asdict(static_gains(record))
+    except StepTestError:
+        return None
+
 
 DEFAULT_LIMITS = ResponseLimits()
 Parameters = ParamSpec("Parameters")

@@ -7,19 +7,64 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.fitting.initial_condition import starts_ringing
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_choice import (
+from omsm_ros.core.estimation.model_order import (
     Candidate,
+    StartingPoints,
     choose,
     explore,
     identifiable,
     information,
 )
-from omsm_ros.core.fitting.output_error import Fit, Problem, evaluated, fit
-from omsm_ros.core.fitting.preparation import Prepared
-from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
+from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
+from omsm_ros.linear_algebra import triangle
+
+# Does the record start while the machine still rings from an earlier motion?
+#
+# The motion before the first sample is unknown, but its response since then is a sum of decays at
+# the poles of G. Fast ones are over before the first sample that counts. A lightly damped mode may
+# ring for a second, and a fit that takes its ringing for a response to the motion is biased.
+
+# χ² a column must explain to be taken: four sigma.
+_CLEARLY_SHOWN = 16.0
+# A decay by e to this power is over.
+_OVER = 10.0
+# Directions this much weaker than the strongest are rounding.
+_SPANNED = 1e-6
+
+
+def starts_ringing(
+    problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
+) -> bool:
+    """Return whether decays at the poles of ``fitted`` reach into the samples that count.
+
+    at_rest: the axis rests at the start; then the decays have to show clearly in the residual
+    colour: power of the noise at low frequency over its mean, see ``information``
+    """
+    counted = np.flatnonzero(problem.used)
+    if problem.fits_initial_condition or fitted.structure.poles == 0 or len(counted) == 0:
+        return False
+    first = float(counted[0]) * problem.period
+    if float(np.min(-fitted.dynamics.poles().real)) * first > _OVER:
+        return False
+    if not at_rest:
+        return True
+    columns = problem.initial_condition_response(fitted)[problem.used]
+    # The fit has already taken of a decay what the parameters of the model can imitate.
+    known = problem.sensitivity(fitted)
+    lengths = [np.sqrt(np.einsum("kq,kq->q", part, part)) for part in (columns, known)]
+    scale = np.concatenate([*lengths, np.ones(1)])
+    scale[scale == 0] = 1.0
+    factor = triangle(columns, known, fitted.residual[:, np.newaxis]) / scale
+    left, values, _ = np.linalg.svd(factor[:-1, :-1])
+    spanned = left[:, values > _SPANNED * values[0]]
+    explained = float(np.sum((spanned.T @ factor[:-1, -1]) ** 2))
+    rest = fitted.sum_of_squares - explained
+    size = spanned.shape[1] - known.shape[1]
+    return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
+
 
 # Of what is worse by so much on fewer samples none is chosen on all of them; a structure is chosen
 # within one parameter of the best, at 14 at most.

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, stats
 
-from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
-from omsm_ros.core.fitting.covariance import autoregression
-from omsm_ros.core.fitting.output_error import Fit, Problem
-from omsm_ros.core.fitting.reading_steps import reading_step
-from omsm_ros.core.fitting.steps import Steps, lasting
-from omsm_ros.core.fitting.uneven_noise import motion_scatter, rate_of, scatter_in_time
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.least_squares import orthonormal
+from omsm_ros.core.estimation.covariance import autoregression
+from omsm_ros.core.estimation.noise import motion_scatter, rate_of, reading_step, scatter_in_time
+from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.steps import Steps, lasting
+from omsm_ros.core.lti.frequency_response import FrequencyResponse
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.linear_algebra import orthonormal
 
 # As resid of the System Identification Toolbox takes.
 _LAGS = 25

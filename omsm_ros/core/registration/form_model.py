@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.samples import scatter
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.streams import statistics
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
@@ -307,7 +307,7 @@ def limit_of(residual: FloatArray) -> float:
     Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
     """
     common = float(np.quantile(np.abs(residual), 1 - _MOST_DUST))
-    return max(OUTLIER_SIGMAS * scatter.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
+    return max(OUTLIER_SIGMAS * statistics.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
 
 
 def most_like(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:

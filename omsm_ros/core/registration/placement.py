@@ -13,11 +13,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray
-from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.statistics import EvenSelection
+from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.posed import Pose
-from omsm_ros.core.surface.slopes import gradient_of, unit_normal
 from omsm_ros.errors import DataError, SurfaceError
 from omsm_ros.readable import quantity
 

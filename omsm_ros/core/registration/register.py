@@ -14,10 +14,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.registration.coarse_placement import (
-    SHARE_OF_SPREAD,
-    coarse_placement,
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.registration.degrees_of_freedom import (
+    AUTO,
+    HELD,
+    Freedoms,
+    Open,
+    Registration,
+    determined,
+    effects_of_held,
+    root_of,
+    shares_of,
+    weakest,
+    widest,
 )
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
@@ -30,9 +39,9 @@ from omsm_ros.core.registration.form_model import (
     most_like,
     relaxed,
 )
-from omsm_ros.core.registration.freedoms import AUTO, HELD, Freedoms, determined, weakest, widest
 from omsm_ros.core.registration.placement import (
     FREEDOMS,
+    LEAST_POINTS,
     Aperture,
     Placement,
     Portion,
@@ -43,18 +52,77 @@ from omsm_ros.core.registration.placement import (
     selection,
     usable,
 )
-from omsm_ros.core.registration.pose_budget import (
-    Open,
-    Registration,
-    effects_of_held,
-    root_of,
-    shares_of,
-)
-from omsm_ros.core.samples import scatter
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams import statistics
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
+
+# The pose of least squares, from which the fit beside form begins.
+
+# With the refinement that follows it took 12 to 36 on spheres and off-axis paraboloids with form.
+_MOST_TURNS = 30
+# A pose stands when its last step moved no point by more than this share of their spread.
+SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
+
+
+def coarse_placement(
+    surface: Surface,
+    chosen: Portion,
+    names: Sequence[str],
+    aperture: Aperture | None,
+    at: Placement,
+) -> Placement:
+    """Return the placement of least squares, points far from the others left out."""
+    for turn in range(_MOST_TURNS):
+        points = usable(placed(surface, at, chosen), aperture)
+        if turn and len(points.x):
+            middle = points.deviation - np.median(points.deviation)
+            # Generous: what is left here is still the pose.
+            points = points.part(
+                np.abs(middle) <= max(8 * statistics.spread(middle), LEAST_LIMIT_M)
+            )
+        if len(points.x) < LEAST_POINTS:
+            break
+        columns = -freedom_columns(at, points, names)
+        scale = np.sqrt(np.mean(columns**2, axis=1))
+        columns /= scale[:, np.newaxis]
+        step = _bounded_step(
+            columns,
+            points.deviation,
+            np.array([at.value(n) for n in names]) * scale,
+            [widest(n) for n in names] * scale,
+        )
+        at = at.moved(names, step / scale)
+        # The refinement that follows converges from far more.
+        settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
+        # Of all freedoms together: what x does a tilt may undo.
+        moved = float(np.sqrt(np.mean((step @ columns) ** 2)))
+        if turn > 1 and moved < settled:
+            return at
+    raise DataError(
+        "the points do not settle on the nominal surface; check its parameters, the sign of its "
+        "radii and the units of the cloud, or fit fewer freedoms"
+    )
+
+
+def _bounded_step(
+    columns: FloatArray, deviation: FloatArray, at: FloatArray, widest_: FloatArray
+) -> FloatArray:
+    """Return the step (p,) along ``columns`` (p, n) that explains ``deviation`` (n,) best.
+
+    What no step explains, the form, is of one kind over the whole part, and says nothing of a
+    freedom that does less than it: such a one stays within what a part may be off by.
+
+    at: where the freedoms stand;  widest_: how far they may be off;  both (p,) as steps are
+    """
+    free = np.linalg.lstsq(columns.T, deviation, rcond=1e-12)[0]
+    form = float(np.sqrt(np.mean((deviation - free @ columns) ** 2)))
+    weight = np.sqrt(len(deviation)) * form / widest_
+    rows = np.concatenate([columns.T, np.diag(weight)])
+    found = np.linalg.lstsq(rows, np.concatenate([deviation, -weight * at]), rcond=1e-12)
+    return np.asarray(found[0], np.float64)
+
 
 # Points at a time: 7 freedoms and 42 polynomials of each are 6 MB.
 CHUNK = 16_384
@@ -270,7 +338,7 @@ class _Fit:
             found, _ = self.solved(at, sums)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             step = found.step * own
-            settled = max(SHARE_OF_SPREAD * scatter.spread(residual), LEAST_LIMIT_M)
+            settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
             # Of all freedoms together: what x does a tilt may undo.
             gram = sums.gram[: len(step), : len(step)]
             square = float(found.step @ gram @ found.step) / sums.points

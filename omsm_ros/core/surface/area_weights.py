@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.quantities import MAP_SPACING
 
 # A raster passes the axis now on this side, now on that, and never gets around it twice.

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import FloatArray, IntArray
-from omsm_ros.core.samples.even_selection import EvenSelection
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.errors import DataError
-from omsm_ros.least_squares import least_squares
+from omsm_ros.linear_algebra import least_squares
 from omsm_ros.readable import plain, quantity
 
 # Of a ring of a profile, each seen once at least: form of up to five waves around averages out.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, POSITION, UNCERTAINTY
 

@@ -10,16 +10,346 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval2d
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
-from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, ZernikeSurface
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aspheres import (
+    Asphere,
+    Biconic,
+    Series,
+    Toroid,
+    bfs_series,
+    checked_terms,
+    con_series,
+    curvature_of,
+    freeform_series,
+    root_of,
+)
+from omsm_ros.core.surface.height_grid import Gradient
 from omsm_ros.core.surface.posed import OffAxisSection, Sum
-from omsm_ros.core.surface.q_freeform import QFreeform
-from omsm_ros.core.surface.slopes import Gradient
+from omsm_ros.core.surface.zernike_terms import (
+    MOST_FRINGE,
+    NUMBERING,
+    Indexing,
+    Norm,
+    Term,
+    first_terms,
+    rms_of,
+    zernike_slopes,
+    zernike_values,
+)
 from omsm_ros.errors import SurfaceError
-from omsm_ros.quantities import FOCAL_LENGTH, LENGTH, RADIUS
+from omsm_ros.quantities import (
+    CONIC_CONSTANT,
+    DISC_RADIUS,
+    FOCAL_LENGTH,
+    LENGTH,
+    RADIUS,
+    TERM_ORDER,
+    TERM_SIZE,
+)
+
+# Shapes by a series of terms: XY polynomial, Zernike, and Forbes' Q polynomials.
+
+# Up to order 27; a picture of them takes two seconds and 400 MB.
+MOST_ZERNIKES = 400
+
+
+@dataclass(frozen=True, slots=True)
+class XYTerm:
+    """``value`` [m] times (x/radius)^``x`` (y/radius)^``y``."""
+
+    x: int
+    y: int
+    value: float
+
+    def __post_init__(self) -> None:
+        TERM_ORDER.checked(self.x, SurfaceError, "power of x")
+        TERM_ORDER.checked(self.y, SurfaceError, "power of y")
+        TERM_SIZE.checked(self.value, SurfaceError, "value")
+
+
+@dataclass(frozen=True, slots=True)
+class XYPolynomial:
+    """``z = Σ value (x/radius)^i (y/radius)^j``; ``radius`` [m] makes every value a length."""
+
+    radius: float
+    terms: tuple[XYTerm, ...]
+
+    def __post_init__(self) -> None:
+        DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]."""
+        return self._at(x, y, self._coefficients())
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        along_x, along_y = (
+            np.asarray(polyder(self._coefficients(), axis=k) / self.radius, np.float64)
+            for k in range(2)
+        )
+        return self._at(x, y, along_x), self._at(x, y, along_y)
+
+    def _coefficients(self) -> FloatArray:
+        """Return the value [m] of each pair of powers (i, j); terms of equal powers add up."""
+        table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
+        for term in self.terms:
+            table[term.x, term.y] += term.value
+        return table
+
+    def _at(self, x: FloatArray, y: FloatArray, coefficients: FloatArray) -> FloatArray:
+        u, v = np.broadcast_arrays(np.asarray(x) / self.radius, np.asarray(y) / self.radius)
+        return np.asarray(polyval2d(u, v, coefficients), np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class ZernikeSurface:
+    """A sum of Zernike polynomials over a disc about the origin.
+
+    radius: of the disc [m], beyond which the polynomials go on
+    coefficients: [m], from the first number of the ``indexing`` on: 1 for Noll and Fringe, 0 for
+        ANSI;  norm: "peak": each term is one at the rim, "rms": of root mean square one
+
+    Cosines have m > 0 and sines m < 0, their angle counts from x towards y.
+    """
+
+    radius: float
+    coefficients: tuple[float, ...]
+    indexing: Indexing = "fringe"
+    norm: Norm = "peak"
+
+    def __post_init__(self) -> None:
+        DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
+        if self.indexing not in NUMBERING:
+            raise SurfaceError(f"indexing is {self.indexing!r}, expected one of {list(NUMBERING)}")
+        if self.norm not in ("peak", "rms"):
+            raise SurfaceError(f"norm is {self.norm!r}, expected 'peak' or 'rms'")
+        most = MOST_FRINGE if self.indexing == "fringe" else MOST_ZERNIKES
+        if len(self.coefficients) > most:
+            raise SurfaceError(
+                f"coefficients are {len(self.coefficients)}, expected {most} at most in the "
+                f"numbering {self.indexing!r}"
+            )
+        for place, value in enumerate(self.coefficients):
+            TERM_SIZE.checked(value, SurfaceError, f"coefficients[{place}]")
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]."""
+        u, v = self._on_the_disc(x, y)
+        terms, sizes = self._terms()
+        made = sizes @ zernike_values(u.ravel(), v.ravel(), terms) if terms else np.zeros(u.size)
+        return np.asarray(made.reshape(u.shape), np.float64)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        u, v = self._on_the_disc(x, y)
+        terms, sizes = self._terms()
+        if not terms:
+            return np.zeros(u.shape), np.zeros(u.shape)
+        along_x, along_y = (
+            (sizes @ slopes / self.radius).reshape(u.shape)
+            for slopes in zernike_slopes(u.ravel(), v.ravel(), terms)
+        )
+        return along_x, along_y
+
+    def _on_the_disc(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u, v = np.broadcast_arrays(x, y)
+        return u / self.radius, v / self.radius
+
+    def _terms(self) -> tuple[list[Term], FloatArray]:
+        """Return the terms that are there, and their sizes at the rim [m]."""
+        numbered = first_terms(len(self.coefficients), self.indexing)
+        used = [(t, c) for t, c in zip(numbered, self.coefficients, strict=True) if c]
+        scale = [1 / rms_of(t) if self.norm == "rms" else 1.0 for t, _ in used]
+        return [t for t, _ in used], np.array([c for _, c in used]) * scale
+
+
+@dataclass(frozen=True, slots=True)
+class QBfs:
+    """Forbes' mild asphere: a best-fit sphere and a departure along its normal.
+
+    ``z = sphere + u²(1 − u²) Σ a_m Q_m^bfs(u²) / √(1 − r²/R²)``, ``u = r/aperture_radius``
+
+    radius: R of the sphere [m], None for flat;  aperture_radius: where u is one [m]
+    coefficients: a_0, a_1 … [m]
+    """
+
+    aperture_radius: float
+    coefficients: tuple[float, ...]
+    radius: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_series(self.aperture_radius, self.radius, self.coefficients)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
+        height, _ = self._by_square(np.square(x) + np.square(y))
+        return height
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        _, rate = self._by_square(np.square(x) + np.square(y))
+        return np.asarray(2 * rate * x), np.asarray(2 * rate * y)
+
+    def _by_square(self, s: FloatArray) -> Series:
+        """Return the height over s = r², and its derivative by s."""
+        c, area = curvature_of(self.radius), self.aperture_radius**2
+        u = s / area
+        root = root_of(1 - c**2 * s)
+        q, slope = bfs_series(self.coefficients, u)
+        bump, bump_slope = u * (1 - u) * q, (1 - 2 * u) * q + u * (1 - u) * slope
+        rate = c / (2 * root) + bump_slope / (area * root) + bump * c**2 / (2 * root**3)
+        return np.asarray(c * s / (1 + root) + bump / root), np.asarray(rate)
+
+
+@dataclass(frozen=True, slots=True)
+class QCon:
+    """Forbes' strong asphere: a conic and a departure along the axis.
+
+    ``z = conic + u⁴ Σ a_m Q_m^con(u²)``, ``u = r/aperture_radius``
+
+    radius, conic_constant: of the conic [m], [1], as in an asphere
+    aperture_radius: where u is one [m];  coefficients: a_0, a_1 … [m]
+    """
+
+    aperture_radius: float
+    coefficients: tuple[float, ...]
+    radius: float | None = None
+    conic_constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_series(self.aperture_radius, self.radius, self.coefficients)
+        CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]; NaN where the conic has ended."""
+        u = (np.square(x) + np.square(y)) / self.aperture_radius**2
+        bump, _ = con_series(self.coefficients, u)
+        return np.asarray(self._conic().height(x, y) + u**2 * bump)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        area = self.aperture_radius**2
+        u = (np.square(x) + np.square(y)) / area
+        bump, slope = con_series(self.coefficients, u)
+        rate = 2 * (2 * u * bump + u**2 * slope) / area
+        along_x, along_y = self._conic().gradient(x, y)
+        return np.asarray(along_x + rate * x), np.asarray(along_y + rate * y)
+
+    def _conic(self) -> Asphere:
+        return Asphere(self.radius, self.conic_constant)
+
+
+def _check_series(
+    aperture_radius: float, radius: float | None, coefficients: tuple[float, ...]
+) -> None:
+    DISC_RADIUS.checked(aperture_radius, SurfaceError, "aperture_radius")
+    if radius is not None:
+        RADIUS.checked(radius, SurfaceError)
+    checked_terms(coefficients, "coefficients", TERM_SIZE)
+
+
+# Forbes' freeform: a best-fit sphere and gradient-orthogonal terms with and without an angle.
+
+
+@dataclass(frozen=True, slots=True)
+class QTerm:
+    """``value`` [m] of the term of degree ``n`` in u² and angular order ``m``.
+
+    cos mθ for m > 0, sin |m|θ for m < 0, with θ from x towards y
+    """
+
+    n: int
+    m: int
+    value: float
+
+    def __post_init__(self) -> None:
+        TERM_ORDER.checked(self.n, SurfaceError, "degree n")
+        TERM_ORDER.checked(abs(self.m), SurfaceError, "angular order |m|")
+        TERM_SIZE.checked(self.value, SurfaceError, "value")
+
+
+@dataclass(frozen=True, slots=True)
+class QFreeform:
+    """A sphere and a departure along its normal (Opt. Express 20, 2483, eq. 2.2).
+
+    ``z = sphere + δ / √(1 − r²/R²)``, ``u = r/aperture_radius``, ``δ = u²(1 − u²) Σ a_n Q_n^bfs(u²)
+    + Σ u^m [a_nm cos mθ + b_nm sin mθ] Q_n^m(u²)``
+
+    radius: R of the sphere [m], None for flat;  aperture_radius: where u is one [m]
+    terms: those of m = 0 are the ones of Q bfs; terms of equal n and m add up
+    """
+
+    aperture_radius: float
+    terms: tuple[QTerm, ...]
+    radius: float | None = None
+
+    def __post_init__(self) -> None:
+        DISC_RADIUS.checked(self.aperture_radius, SurfaceError, "aperture_radius")
+        if self.radius is not None:
+            RADIUS.checked(self.radius, SurfaceError)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
+        square, c = np.square(x) + np.square(y), curvature_of(self.radius)
+        root = root_of(1 - c**2 * square)
+        departure, _, _ = self._departure(x, y)
+        return np.asarray(c * square / (1 + root) + departure / root, np.float64)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        c = curvature_of(self.radius)
+        root = root_of(1 - c**2 * (np.square(x) + np.square(y)))
+        departure, along_x, along_y = self._departure(x, y)
+        # Of the sphere, and of 1/root, divided by x or y.
+        rate = c / root + departure * c**2 / root**3
+        return np.asarray(along_x / root + rate * x), np.asarray(along_y / root + rate * y)
+
+    def _departure(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return δ [m] and its slopes [1]; u^m exp(imθ) is a power of (x + iy)/aperture_radius."""
+        w: ComplexArray = np.asarray(np.add(x, np.multiply(1j, y)) / self.aperture_radius)
+        s = np.square(w.real) + np.square(w.imag)
+        total = np.zeros((3, *w.shape))
+        for m, (cosines, sines) in self._by_order().items():
+            if m == 0:
+                q, rate = bfs_series(cosines, s)
+                total[0] += s * (1 - s) * q
+                radial = 2 * ((1 - 2 * s) * q + s * (1 - s) * rate)
+                total[1:] += radial * np.stack([w.real, w.imag])
+                continue
+            lower: ComplexArray = w ** (m - 1)
+            for values, phase in ((cosines, 1.0), (sines, -1j)):
+                if not any(values):
+                    continue
+                turned = _angular(freeform_series(values, m, s), phase * lower, w, m)
+                total += np.stack(turned)
+        total[1:] /= self.aperture_radius
+        return total[0], total[1], total[2]
+
+    def _by_order(self) -> dict[int, tuple[list[float], list[float]]]:
+        """Return the coefficients [m] of cosines and sines for each |m|, by degree from 0 on."""
+        found: dict[int, tuple[list[float], list[float]]] = {}
+        for m in {abs(t.m) for t in self.terms}:
+            degrees = 1 + max(t.n for t in self.terms if abs(t.m) == m)
+            found[m] = ([0.0] * degrees, [0.0] * degrees)
+        for term in self.terms:
+            found[abs(term.m)][term.m < 0][term.n] += term.value
+        return found
+
+
+def _angular(
+    series: Series, lower: ComplexArray, w: ComplexArray, m: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return Re(e wᵐ) q(|w|²) and its derivatives by the parts of w; ``lower`` is e w^(m−1)."""
+    q, rate = series
+    power = (lower * w).real
+    # An analytic function changes along y by i times what it does along x.
+    along_x = m * lower.real * q + 2 * w.real * power * rate
+    along_y = -m * lower.imag * q + 2 * w.imag * power * rate
+    return power * q, along_x, along_y
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from omsm_ros.core.machine.surface_height import Surface
-from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.core.surface.slopes import Gradient, gradient_of
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import Gradient, gradient_of
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import LENGTH, TURN
 

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 
 Norm: TypeAlias = Literal["peak", "rms"]
 Indexing: TypeAlias = Literal["noll", "fringe", "ansi"]

@@ -15,7 +15,7 @@ from omsm_ros.report.certificate.page import (
     sections,
     verdict_on_calibration,
 )
-from omsm_ros.report.common.tables import Table
+from omsm_ros.report.tables import Table
 
 # What could make text from outside into anything but text.
 _SPECIAL = re.compile(r"([\\`*_{}\[\]#|~!$])")

@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import REJECTED
-from omsm_ros.core.sampled.free_run import FreeRun
-from omsm_ros.core.sampled.model import SCHEMA, SampledModel
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
-from omsm_ros.report.certificate import model_figures as drawn
+from omsm_ros.report import style
+from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate.tables import known_rows, texts
-from omsm_ros.report.common import style
-from omsm_ros.report.common.page_parts import Headline, IssuedPage, Section, present
-from omsm_ros.report.common.tables import Table, mapping_table, part
-from omsm_ros.report.common.template import fill, picture
-from omsm_ros.report.common.verdict import Verdict
+from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
+from omsm_ros.report.tables import Table, mapping_table, part
+from omsm_ros.report.verdict import Verdict
 
 BAND, RECORD, CORRELATION = "band", "record", "correlation"
 CAPTIONS = {

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import RECORDED, SCHEMA, Calibration
+from omsm_ros.core.calibration.calibration import RECORDED, SCHEMA, Calibration
 from omsm_ros.readable import (
     NOTHING,
     count,
@@ -22,7 +22,7 @@ from omsm_ros.readable import (
     quantity,
     raised,
 )
-from omsm_ros.report.common.tables import Table, mapping_table, part
+from omsm_ros.report.tables import Table, mapping_table, part
 from omsm_ros.units import PPM
 
 # Where a p-value is called small.

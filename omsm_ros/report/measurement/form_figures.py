@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from omsm_ros.core.samples.blocks import FloatArray
-from omsm_ros.report.common import style
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.report import style
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 # Densities as opticians read them: nm² mm² over waves per millimetre.

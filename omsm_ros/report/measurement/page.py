@@ -2,26 +2,220 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.readable import quantity
-from omsm_ros.report.common import tables
-from omsm_ros.report.common.page_parts import Headline
-from omsm_ros.report.common.tables import part
-from omsm_ros.report.common.template import check_places, fill, picture
-from omsm_ros.report.common.verdict import Verdict, verdict_on_measurement
-from omsm_ros.report.maps.surface_map import EmbeddedMap, policy_of, script
-from omsm_ros.report.measurement.part import (
-    form_table,
-    limits_table,
-    provenance_table,
-    removed_table,
-    verdict_on_part,
-    verdict_on_points,
-)
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.readable import NOTHING, days, expanded, figure, measured, moment_of, plain, quantity
+from omsm_ros.report import tables
+from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
+from omsm_ros.report.page_parts import Headline, check_places, fill, picture
+from omsm_ros.report.tables import Table, part
+from omsm_ros.report.verdict import Verdict, verdict_on_measurement
+from omsm_ros.units import MILLIMETRE_M
+
+# What the page says of the part, of what was taken out, of limits, and of where it is from.
+
+_FIGURES = {
+    "robust_peak_to_valley": "peak to valley of 99.5 % of the part",
+    "peak_to_valley": "peak to valley of all of it, less what noise and other errors add",
+    "rms": "rms",
+    "peak_to_valley_best_fit": "peak to valley of what no move of the part explains (best fit)",
+}
+_SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
+_OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
+_SIGNED = ("Ssk",)
+_CONFORMITY = {
+    "holds": ("good", "The part holds its tolerance"),
+    "fails": ("bad", "The part fails its tolerance"),
+    "cannot tell": ("care", "Too uncertain to tell whether the part holds its tolerance"),
+}
+_POSE_UNITS = {
+    "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
+    "power": "1/m",
+}  # fmt: skip
+
+
+def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verdict | None:
+    """Return the part's deviation, and whether it holds its tolerance; None without a nominal."""
+    deviation = part(form, "deviation")
+    if deviation:
+        words = [
+            f"{name}: {_expanded(deviation[key])}"
+            for key, name in _FIGURES.items()
+            if part(deviation, key, "value") is not None
+        ]
+        words += part(form, "removed", "notes") or ()
+    elif raw := part(summary, "deviation", "corrected"):
+        words = [
+            f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",
+            f"rms {quantity(raw['rms_area_weighted'], 'm')} by area",
+            "uncertainties of these are not evaluated: fit the part's pose, as --fit auto",
+        ]
+    else:
+        return None
+    held = part(form, "conformity") or part(summary, "form", "conformity")
+    if not held:
+        words.append("no tolerance was given (--tolerance), so it is for you to say")
+        return Verdict("unknown", "Deviation from nominal", tuple(words))
+    level, word = _CONFORMITY[held["verdict"]]
+    if level == "good" and part(summary, "light", "level") != "green":
+        # The uncertainty of what nobody looked at is not in it.
+        level, word = "care", f"By what was evaluated, {word[0].lower()}{word[1:]}"
+    tolerance = quantity(held["tolerance"], "m")
+    return Verdict(level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words))
+
+
+def _expanded(figure: Mapping[str, Any]) -> str:
+    """Return a figure with its expanded uncertainty, k = 2."""
+    text = expanded(figure["value"], figure.get("uncertainty"), "m")
+    larger = "; its uncertainty is larger than the figure itself"
+    return text + larger if text.startswith("at most") else text
+
+
+def verdict_on_points(form: Mapping[str, Any]) -> Verdict:
+    """Say how far a form is to be trusted of whose points nothing but themselves is known."""
+    missing = tuple(part(form, "removed", "not_evaluated") or ())
+    if missing:
+        return Verdict(
+            "unknown", "By the points alone", (*(f"not evaluated: {m}" for m in missing),)
+        )
+    return Verdict("care", "By the points and their systematic fields", ("no summary lay beside",))
+
+
+def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return every figure of the deviation by its name, with its expanded uncertainty."""
+    return [
+        (
+            figure(name),
+            expanded(
+                entry["value"], entry["uncertainty"], _OTHER_UNITS.get(name, "m"), name in _SIGNED
+            ),
+        )
+        for name, entry in (part(form, "deviation") or {}).items()
+    ]
+
+
+def form_table(form: Mapping[str, Any], curves: Mapping[str, Any]) -> Table:
+    """Return all figures of the part's form, and what its spectral densities hold."""
+    rows = figure_rows(form)
+    band, inside = (part(curves, "psd", name) for name in ("band", "mean_square_in_band"))
+    if band:
+        ends = " to ".join(plain(frequency * MILLIMETRE_M) for frequency in band)
+        rows.append((f"rms of points in the band of the density, {ends} 1/mm",
+                     quantity(math.sqrt(inside), "m")))  # fmt: skip
+        whole = math.sqrt(part(curves, "psd", "mean_square"))
+        rows.append(("rms of points under its window", quantity(whole, "m")))
+    return Table("Figures of the form", (), [row for row in rows if row[1] != NOTHING])
+
+
+def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
+    """Return what is no longer in the deviation: pose, and what the surface does not determine."""
+    title, columns = "Taken out", ("value", "standard uncertainty")
+    if not form:
+        rows = []
+        if part(summary, "deviation", "corrected"):
+            rows = [("piston, the unknown stand-off of the probe", "mean of the area", NOTHING)]
+        return Table(title, columns, rows)
+    fitted = []
+    for name in part(form, "removed", "fitted") or ():
+        pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
+        spread = settled(form, name)
+        fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
+    held: Mapping[str, str] = part(form, "removed", "held") or {}
+    refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
+    # Each says in words how well the points determine it.
+    reasons = {name: f"held: {why}" for name, why in held.items()}
+    reasons |= {name: f"{why}{dragged(form, name)}" for name, why in refused.items()}
+    if not reasons:
+        return Table(title, columns, fitted)
+    rows = [(*row, "") for row in fitted]
+    rows += [(f"not {name}", NOTHING, NOTHING, why) for name, why in reasons.items()]
+    return Table(title, (*columns, "why not"), rows, prose="why not")
+
+
+def settled(form: Mapping[str, Any], name: str) -> float | None:
+    """Return the standard uncertainty of a freedom, were those that no points determine held.
+
+    What they would drag along changes no form; :func:`dragged` names it.
+    """
+    shares: Mapping[str, Mapping[str, float]] = part(form, "removed", "pose_uncertainty") or {}
+    refused = part(form, "removed", "not_determined") or ()
+    if not shares:
+        return None
+    return math.hypot(*(share[name] for source, share in shares.items() if source not in refused))
+
+
+def dragged(form: Mapping[str, Any], name: str) -> str:
+    """Return what moves with a freedom that the points do not determine, at the same form."""
+    shares: Mapping[str, float] = part(form, "removed", "pose_uncertainty", name) or {}
+    if not shares:
+        return ""
+    sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
+    told = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v]
+    if len(told) < 2:
+        return ""
+    own, *others = told
+    return f"; {own} would go with {', '.join(others)}, at the same form"
+
+
+def _rounded(value: Any, spread: float | None, unit: str) -> str:
+    """Return a value to the place of its uncertainty, without that."""
+    if not spread or unit == "1/m":
+        return _size(value, unit)
+    return measured(value, spread, unit).partition(" ±")[0]
+
+
+def _size(value: Any, unit: str) -> str:
+    if value is None:
+        return NOTHING
+    return plain(value) + " 1/m" if unit == "1/m" else quantity(value, unit)
+
+
+def limits_table(summary: Mapping[str, Any]) -> Table:
+    """Return what bounds the speed of this motion, the tightest first."""
+    limits = sorted(
+        part(summary, "prediction", "limits") or (), key=lambda limit: limit["speed_factor"]
+    )
+    rows = [
+        (
+            str(limit["name"]),
+            _size_of(limit["value"], limit["unit"]),
+            _size_of(limit["allowed"], limit["unit"]),
+            f"{plain(limit['speed_factor'])} ×",
+        )
+        for limit in limits
+    ]
+    return Table("Limits of the motion", ("on this scan", "allowed", "may run faster by"), rows)
+
+
+def _size_of(value: Any, unit: str) -> str:
+    return quantity(value, unit) if unit else plain(value)
+
+
+def _temperature(told: Mapping[str, Any]) -> str:
+    if not told:
+        return NOTHING
+    mean, change = quantity(told.get("mean"), "°C", 4), quantity(told.get("change"), "K", 2, True)
+    return f"{mean}, {change} from the beginning to the end"
+
+
+def provenance_table(summary: Mapping[str, Any]) -> Table:
+    """Return from which recording and by which calibration a result is."""
+    admission = part(summary, "admission")
+    rows = [
+        ("recording", str(part(summary, "bag") or NOTHING)),
+        ("recorded", moment_of(part(summary, "conditions", "recorded_ns"))),
+        ("temperature", _temperature(part(summary, "conditions", "temperature") or {})),
+        ("calibration", str(part(summary, "calibration") or NOTHING)),
+        ("its age then", days(part(summary, "conditions", "calibration_age"))),
+        ("overridden", "yes" if part(admission or {}, "overridden") else "no"),
+        ("files", ", ".join(map(str, (part(summary, "files") or {}).values())) or NOTHING),
+    ]
+    known = [row for row in rows if row[1] != NOTHING]
+    return Table("Provenance", (), known if part(summary, "bag") else [])
 
 
 @dataclass(frozen=True, slots=True)

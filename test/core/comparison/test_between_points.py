@@ -5,9 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.cells import TREND_DEGREE, Trend, averaged, cell_side, portions
 from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named, match
-from omsm_ros.core.comparison.resampling import LocalQuadratic, on_grid
+from omsm_ros.core.comparison.resampling import (
+    TREND_DEGREE,
+    LocalQuadratic,
+    Trend,
+    averaged,
+    cell_side,
+    on_grid,
+    portions,
+)
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import ConfigurationError, DataError

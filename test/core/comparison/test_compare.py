@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from omsm_ros.core.comparison.compare import compare
+from omsm_ros.core.comparison.compare import AGREE, CANNOT_TELL, DIFFER, compare
 from omsm_ros.core.comparison.matching import SEATED
 from omsm_ros.core.comparison.stated_errors import ESTIMATED, Measurement
-from omsm_ros.core.comparison.verdict import AGREE, CANNOT_TELL, DIFFER
-from omsm_ros.core.correction.scan_fields import ScanFields
+from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import ConfigurationError, DataError
 

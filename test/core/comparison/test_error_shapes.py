@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.error_shapes import drift, likely_drift
+from omsm_ros.core.comparison.stated_errors import drift, likely_drift
 
 _PLACES, _NOISE = 300, 0.3e-9
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.cells import cell_side
-from omsm_ros.core.comparison.resampling import LocalQuadratic, on_grid
+from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side, on_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.error_shapes import drift, likely_drift, unknown_form
 from omsm_ros.core.comparison.stated_errors import (
     AT_ONCE,
     ESTIMATED,
     STATED,
     Errors,
     Measurement,
+    drift,
     drift_size,
+    likely_drift,
+    unknown_form,
 )
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 

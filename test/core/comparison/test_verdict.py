@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.comparison.agreement import TERMS, Agreement, Number, TermNumber
-from omsm_ros.core.comparison.verdict import AGREE, CANNOT_TELL, DIFFER, verdict_of
+from omsm_ros.core.comparison.compare import AGREE, CANNOT_TELL, DIFFER, verdict_of
 
 COMPARED_M = 100e-9
 

@@ -8,13 +8,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.samples.accounts import Account, StreamAccount
-from omsm_ros.core.samples.blocks import Block
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.streams.blocks import Account, Block, StreamAccount
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 

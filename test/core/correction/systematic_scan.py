@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omsm_ros.core.correction.systematic import ScanPoints
-from omsm_ros.core.machine.kinematics import workpiece_xy
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 
 RADIUS, TURNS, OMEGA = 12.7e-3, 20.0, np.pi

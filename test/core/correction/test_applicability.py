@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.applicability import admit, objections
-from omsm_ros.core.dynamics.calibration import Calibration, settings_with
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.calibration.applicability import admit, objections
+from omsm_ros.core.calibration.calibration import Calibration, settings_with
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 
 SETTINGS = {"exposure_s": 0.5e-3, "averaging": 1, "machine": "Nanoform 250", "triggered": True}

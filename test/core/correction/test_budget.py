@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.machine_sources import (
@@ -16,13 +17,16 @@ from omsm_ros.core.correction.machine_sources import (
     StatedSource,
     declared_sources,
 )
-from omsm_ros.core.correction.scan_trace import MOST_TRACED, ScanTrace
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, NOT_EVALUATED
+from omsm_ros.core.correction.systematic import (
+    DECLARED,
+    EVALUATED,
+    MOST_TRACED,
+    NOT_EVALUATED,
+    ScanTrace,
+)
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, with_latency
-from omsm_ros.core.machine.kinematics import Geometry, WorkpiecePoints
+from omsm_ros.core.kinematics.kinematics import Geometry, WorkpiecePoints
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Recording

@@ -7,18 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.calibration_set import CalibrationSet, calibration_set
+from omsm_ros.core.calibration.calibration import Calibration, declared, latency_of, with_latency
+from omsm_ros.core.calibration.calibration_set import CalibrationSet, calibration_set
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, latency_of, with_latency
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.samples.accounts import Account
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import Account
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import CalibrationError
-from omsm_ros.storage.calibration_file import load_calibration, save_calibration
+from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.twin.cell import Cell, Probe, Recording, blocks_of, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.structure import StructureErrors

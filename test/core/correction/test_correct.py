@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from omsm_ros.core.calibration.calibration import declared, with_latency
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, lateral_lag
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.latency import declared, with_latency
-from omsm_ros.core.machine.kinematics import Geometry
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN

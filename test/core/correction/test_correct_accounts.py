@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.samples.accounts import Account
-from omsm_ros.core.samples.blocks import Status
+from omsm_ros.core.streams.blocks import Account, Status
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Recording
 

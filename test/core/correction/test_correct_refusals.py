@@ -10,7 +10,7 @@ import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.twin.cell import Recording
 

@@ -9,13 +9,11 @@ import pytest
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
-from omsm_ros.core.samples.accounts import Account
-from omsm_ros.core.samples.blocks import Block
-from omsm_ros.core.samples.merging import consecutive, joined, uninterrupted
-from omsm_ros.core.samples.motion_record import assemble
-from omsm_ros.core.samples.slips import CommonTrigger
+from omsm_ros.core.streams.blocks import Account, Block, consecutive, joined, uninterrupted
+from omsm_ros.core.streams.motion_record import assemble
+from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import DataError
-from omsm_ros.nodes.correction_state import CorrectionState
+from omsm_ros.nodes.corrector_node import CorrectionState
 from omsm_ros.nodes.diagnostics import ERROR
 from omsm_ros.twin.cell import Recording
 

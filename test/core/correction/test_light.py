@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.correction.light import AMBER, GREEN, RED, Light, Reason, light_of, noisier
+from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
+from omsm_ros.core.correction.budget import AMBER, GREEN, RED, Light, Reason, light_of, noisier
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, with_latency
 
 LOOKED_AT = {
     "tilt": {},

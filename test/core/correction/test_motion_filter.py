@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import (
     SETTLED,
     MotionFilter,
     MotionFilters,
     forgotten_after,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.accounts import Reason
-from omsm_ros.core.samples.pairing import Run
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import Reason
+from omsm_ros.core.streams.pairing import Run
 from omsm_ros.twin.plant import Plant
 
 G = Plant().dynamics

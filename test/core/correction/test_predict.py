@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy import interpolate, signal
 
-from omsm_ros.core.correction.motion_residual import Residual
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.predict import (
     Prediction,
+    Residual,
     dynamic_error,
     predict_error,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.limits import FASTEST, MachineLimits
-from omsm_ros.core.machine.scan_path import ScanPath
-from omsm_ros.core.machine.trajectories import Chirp, Spiral
+from omsm_ros.core.kinematics.limits import FASTEST, MachineLimits
+from omsm_ros.core.kinematics.scan_path import ScanPath
+from omsm_ros.core.kinematics.trajectories import Chirp, Spiral
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.plant import PAPER_EQ_12

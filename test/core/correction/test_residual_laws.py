@@ -9,14 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.correction.motion_residual import Residual, running_mean
-from omsm_ros.core.correction.predict import dynamic_error, predict_error
-from omsm_ros.core.correction.unknown_curves import components, fading, random_walk, smooth
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.limits import MachineLimits
-from omsm_ros.core.machine.scan_path import ScanPath
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.predict import Residual, dynamic_error, predict_error, running_mean
+from omsm_ros.core.correction.source_kinds import components, fading, random_walk, smooth
+from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.kinematics.scan_path import ScanPath
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
 
 PERIOD, COUNT = 1e-3, 6000
 TIME = PERIOD * np.arange(COUNT)

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.scan_fields import resolves_turns, scan_fields
 from omsm_ros.core.correction.source_kinds import source_of
-from omsm_ros.core.correction.systematic import DECLARED, standard_fields
+from omsm_ros.core.correction.systematic import (
+    DECLARED,
+    resolves_turns,
+    scan_fields,
+    standard_fields,
+)
 
 from .systematic_scan import spiral_points
 

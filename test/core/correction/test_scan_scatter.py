@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.budget import noisier
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.light import noisier
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock, FloatArray
-from omsm_ros.core.samples.scatter import RunningScatter
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.streams.statistics import RunningScatter
 
 NOISE = 10e-9
 COUNT = 20_000

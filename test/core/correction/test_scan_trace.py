@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.correction.scan_trace import ScanTrace
-from omsm_ros.core.correction.systematic import ScanPoints
-from omsm_ros.core.machine.kinematics import WorkpiecePoints
-from omsm_ros.core.samples.blocks import FloatArray
+from omsm_ros.core.correction.systematic import ScanPoints, ScanTrace
+from omsm_ros.core.kinematics.kinematics import WorkpiecePoints
+from omsm_ros.core.streams.blocks import FloatArray
 
 COUNT, PERIOD = 500, 1e-3
 TIME = 40.0 + PERIOD * np.arange(COUNT)

@@ -10,15 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.correction.calibration_set import (
+from omsm_ros.core.calibration.calibration import (
+    Calibration,
+    declared,
+    latency_of,
+    unresolved,
+    with_latency,
+)
+from omsm_ros.core.calibration.calibration_set import (
     MOST_MEMBERS,
     CalibrationSet,
     calibration_set,
     set_from_content,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.latency import declared, latency_of, unresolved, with_latency
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 
 

@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.motion_residual import Residual
-from omsm_ros.core.correction.predict import predict_error
+from omsm_ros.core.correction.predict import Residual, predict_error
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.machine.limits import MachineLimits
-from omsm_ros.core.machine.scan_path import ScanPath
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.kinematics.scan_path import ScanPath
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 
 PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015
 AMPLITUDE = 0.5e-3

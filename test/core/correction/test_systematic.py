@@ -14,11 +14,11 @@ from omsm_ros.core.correction.systematic import (
     SystematicSource,
     standard_fields,
 )
-from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
+from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.machine_errors import Harmonic, SpindleError
-from omsm_ros.twin.part_pose import PartPose, PosedSurface
+from omsm_ros.twin.part import PartPose, PosedSurface
 
 from .systematic_scan import spiral_points
 

@@ -9,6 +9,7 @@ import pytest
 from numpy.polynomial import polynomial
 from scipy import signal
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import (
@@ -17,10 +18,9 @@ from omsm_ros.core.correction.uncertainty import (
     sensitivity_filters,
     with_lateral,
 )
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.discretisation import discretise
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.samples.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.lti.discretisation import discretise
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_EQ_12

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.unknown_curves import (
-    Kernel,
-    components,
-    fading,
-    random_walk,
-    smooth,
-)
+from omsm_ros.core.correction.source_kinds import Kernel, components, fading, random_walk, smooth
 
 TIME = np.linspace(0.0, 250.0, 700)
 

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.cells import Cells
-from omsm_ros.core.form.figures import DeviationMap
-from omsm_ros.core.form.power_density import power_density
-from omsm_ros.core.form.texture import bands_of, texture
+from omsm_ros.core.form.deviation_map import Cells, DeviationMap
+from omsm_ros.core.form.texture import bands_of, power_density, texture
 from omsm_ros.errors import DataError
 
 SIDE = 20e-3

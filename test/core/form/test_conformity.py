@@ -2,8 +2,7 @@
 
 import pytest
 
-from omsm_ros.core.form.conformity import FAILS, HOLDS, OPEN, conformity
-from omsm_ros.core.form.figures import Figure
+from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, Figure, conformity
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.figures import (
+from omsm_ros.core.form.deviation_map import (
     DeviationMap,
     noise_beside,
     root_mean_square,
@@ -11,7 +11,7 @@ from omsm_ros.core.form.figures import (
 )
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.samples.scatter import noise_of
+from omsm_ros.core.streams.statistics import noise_of
 
 DISC = Aperture(1e-2)
 POINTS = 20_000

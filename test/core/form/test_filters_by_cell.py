@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.cells import Cells, gaussian_weights
-from omsm_ros.core.form.figures import Figure
-from omsm_ros.core.form.power_density import power_density
-from omsm_ros.core.form.texture import bands_of, slopes_without_second_order, texture
+from omsm_ros.core.form.deviation_map import Cells, Figure, gaussian_weights
+from omsm_ros.core.form.texture import bands_of, power_density, slopes_without_second_order, texture
 
 RNG = np.random.default_rng(12)
 

@@ -7,26 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.cells import Cells
-from omsm_ros.core.form.figures import (
+from omsm_ros.core.form.analyse import optical_terms
+from omsm_ros.core.form.deviation_map import (
+    Cells,
     DeviationMap,
     Figure,
     noise_beside,
     root_mean_square,
     weighted_quantiles,
 )
-from omsm_ros.core.form.local_means import LocalMeans
-from omsm_ros.core.form.optical_terms import optical_terms
-from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
-from omsm_ros.core.form.power_density import Curve
-from omsm_ros.core.form.profiles import profiles
-from omsm_ros.core.form.removal import (
+from omsm_ros.core.form.part_figures import (
+    LocalMeans,
     asymmetric,
+    extents_of_part,
+    rms_of_part,
     without,
     without_form,
     without_power,
     without_tilt,
 )
+from omsm_ros.core.form.texture import Curve, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.local_means import LocalMeans, closest_means
+from omsm_ros.core.form.part_figures import LocalMeans, closest_means
 
 RANDOM = np.random.default_rng(3)
 X, Y = RANDOM.uniform(-1.0, 1.0, (2, 12_000))

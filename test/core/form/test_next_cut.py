@@ -7,10 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.compensation import Compensation, compensation
-from omsm_ros.core.form.figures import DeviationMap
-from omsm_ros.core.form.tool_path import path_gcode, spiral_offsets
-from omsm_ros.core.machine.trajectories import Spiral
+from omsm_ros.core.form.compensation import Compensation, compensation, path_gcode, spiral_offsets
+from omsm_ros.core.form.deviation_map import DeviationMap
+from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.surface.nominal import Flat, Sphere
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import ConfigurationError, DataError

@@ -4,8 +4,7 @@ import numpy as np
 
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import Aperture, Portion
-from omsm_ros.core.surface.freeforms import ZernikeSurface
-from omsm_ros.core.surface.nominal import Sphere
+from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 
 RADIUS = 12.7e-3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.passes import passes
+from omsm_ros.core.form.zernike_fit import passes
 
 RANDOM = np.random.default_rng(5)
 

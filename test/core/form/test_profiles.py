@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.figures import DeviationMap
-from omsm_ros.core.form.optical_terms import optical_terms
-from omsm_ros.core.form.profiles import profiles
-from omsm_ros.core.form.removal import without_form
+from omsm_ros.core.form.analyse import optical_terms
+from omsm_ros.core.form.deviation_map import DeviationMap
+from omsm_ros.core.form.part_figures import without_form
+from omsm_ros.core.form.texture import profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values

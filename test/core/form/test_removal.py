@@ -1,7 +1,7 @@
 import numpy as np
 
-from omsm_ros.core.form.figures import DeviationMap
-from omsm_ros.core.form.removal import best_fit, without_second_order
+from omsm_ros.core.form.deviation_map import DeviationMap
+from omsm_ros.core.form.part_figures import best_fit, without_second_order
 
 
 def test_the_second_order_goes_and_nothing_else():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.form.figures import DeviationMap
+from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
 from omsm_ros.core.registration.placement import Aperture, Portion
 from omsm_ros.core.surface.aspheres import Biconic

@@ -4,11 +4,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.departures.hysteresis import lost_in_gaps, through_gap, without_noise
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.model_errors.families import lost_in_gaps, through_gap, without_noise
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER = 1e-3, 20
 LAG_S = 0.34e-3

@@ -9,7 +9,7 @@ import pytest
 from scipy import signal
 
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, DWELL = 1e-3, 20, 0.75
 STEP_M, RISE_S, NOISE_M = 9.8e-6, 20e-3, 10e-9

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.departures.survey import Survey
-from omsm_ros.core.dynamics.response_band import ResponseLimits
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.certificate import certificate_of, verdict
-from omsm_ros.core.identification.departure_search import Searched
+from omsm_ros.core.calibration.finding import Finding
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.evidence import Evidence
-from omsm_ros.core.identification.finding import Finding
+from omsm_ros.core.identification.identify import certificate_of, verdict
 from omsm_ros.core.identification.model_choice import choose_model
+from omsm_ros.core.identification.model_error_search import Searched
 from omsm_ros.core.identification.response_uncertainty import response_uncertainty
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.lti.frequency_response import ResponseLimits
+from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.streams.motion_record import assemble
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ from itertools import chain
 
 import pytest
 
-from omsm_ros.core.dynamics.response_band import ResponseLimits
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.checks import (
     late,
     misfit,
@@ -17,6 +15,8 @@ from omsm_ros.core.identification.checks import (
     two_clocks,
 )
 from omsm_ros.core.identification.covariance_terms import hidden_motion_finding
+from omsm_ros.core.lti.frequency_response import ResponseLimits
+from omsm_ros.core.lti.transfer_function import TransferFunction
 
 LIMITS = ResponseLimits(gain=0.01, phase=0.02)
 SLOW = TransferFunction.from_ascending([1.0], [1.0, 1e-2])

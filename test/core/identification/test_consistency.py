@@ -5,16 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.departures.contrasts import HALVES, SIZES, UP_DOWN, contrasts
-from omsm_ros.core.departures.survey import Survey
-from omsm_ros.core.dynamics.response_band import low_frequency_delay_uncertainty
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.consistency import consistency
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.preparation import prepare
+from omsm_ros.core.identification.covariance_terms import consistency
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.step_plan import StepPlan
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepPlan
+from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
+from omsm_ros.core.model_errors.residual_diagnostics import (
+    HALVES,
+    SIZES,
+    UP_DOWN,
+    Survey,
+    contrasts,
+)
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 5e-9
 SMALL, LARGE = 3e-6, 9.8e-6

@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.departures.families import (
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.preparation import prepare
+from omsm_ros.core.identification.checks import agreement, departures, independence
+from omsm_ros.core.identification.covariance_terms import reference_lag
+from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.identification.model_error_search import Searched, _beside, _with_columns, search
+from omsm_ros.core.identification.response_uncertainty import gain_above_rest
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,
     DRIFT,
@@ -16,26 +28,9 @@ from omsm_ros.core.departures.families import (
     dahl,
     relaxed,
 )
-from omsm_ros.core.departures.hidden import hidden_terms, relaxation_found
-from omsm_ros.core.departures.reference_lag import reference_lag
-from omsm_ros.core.departures.survey import Survey
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import Problem, fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.departure_checks import agreement, departures, independence
-from omsm_ros.core.identification.departure_search import (
-    Searched,
-    _beside,
-    _with_columns,
-    search,
-)
-from omsm_ros.core.identification.hidden_terms import gain_above_rest
-from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.undetected import hidden_terms, relaxation_found
+from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD, LAG = 1e-3, 0.7e-3

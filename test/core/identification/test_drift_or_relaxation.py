@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 
-from omsm_ros.core.departures.families import CREEP, DRIFT, FASTEST_CREEP_S, relaxed
-from omsm_ros.core.departures.hidden import hidden_terms, relaxation_found, without_drift
-from omsm_ros.core.departures.survey import Survey
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.departure_search import search
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.families import CREEP, DRIFT, FASTEST_CREEP_S, relaxed
+from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.undetected import hidden_terms, relaxation_found, without_drift
 
 
 def walk(size, seed=3):

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.model_structure import Scaled
-from omsm_ros.core.fitting.output_error import fit
-from omsm_ros.core.fitting.steps import find_steps
+from omsm_ros.core.estimation.model_structure import Scaled
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.fitted_record import (
     autocorrelation,
     fitted_record,
     mean_at_edges,
 )
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell
 from omsm_ros.twin.cell import record as recorded

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import Chirp, Multisine
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import Chirp, Multisine
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import IdentificationError, StepTestError
 from omsm_ros.twin.cell import Cell, record

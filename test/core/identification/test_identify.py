@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.dynamics.masses_and_springs import TwoMass
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import Chirp, StepTest
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.modes import TwoMass
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant

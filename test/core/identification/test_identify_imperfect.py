@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.dynamics.response_band import response_band
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import (
     ConfigurationError,
     DataError,

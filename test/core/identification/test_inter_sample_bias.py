@@ -8,10 +8,10 @@ and without any fit.
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.steps import find_steps
-from omsm_ros.core.identification.inter_sample_bias import inter_sample_delay_bound
-from omsm_ros.core.machine.trajectories import Chirp, StepTest
+from omsm_ros.core.estimation.steps import find_steps
+from omsm_ros.core.identification.covariance_terms import inter_sample_delay_bound
+from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant, respond

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.model_structure import Scaled, Structure
-from omsm_ros.core.fitting.output_error import Problem, fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.fitting.starting_points import StartingPoints, coarser
+from omsm_ros.core.estimation.model_order import StartingPoints, coarser
+from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.residual_tests import follows_beyond
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord, assemble
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant

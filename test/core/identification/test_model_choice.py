@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.fitting.descent import Effort
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.order_choice import Candidate, information
-from omsm_ros.core.fitting.output_error import fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.fitting.starting_points import StartingPoints
+from omsm_ros.core.estimation.model_order import Candidate, StartingPoints, information
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import Model, chosen_alike, no_worse
 
 from .recorded_motions import record_of, recorded

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from late_steps import LATE, NOISE, STEPS, TIME, late_record
 
-from omsm_ros.core.departures.families import DRIFT, PERIODIC, VIBRATION
-from omsm_ros.core.departures.survey import Survey
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import fit
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.departure_search import search
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.model_errors.families import DRIFT, PERIODIC, VIBRATION
+from omsm_ros.core.model_errors.residual_diagnostics import Survey
 
 
 def prepared_of(added):

@@ -5,13 +5,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass
-from omsm_ros.core.dynamics.modes import known_modes
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.modes import FITTED, TwoMass, known_modes
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant

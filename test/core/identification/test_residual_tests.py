@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from omsm_ros.core.dynamics.frequency_response import frequency_response
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.fitting.model_structure import Structure
-from omsm_ros.core.fitting.output_error import Problem, fit
-from omsm_ros.core.fitting.steps import find_steps
+from omsm_ros.core.calibration.verification import check_path
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.residual_tests import (
     independence,
     noise_colour,
@@ -18,8 +17,9 @@ from omsm_ros.core.identification.residual_tests import (
     response_agreement,
     whiteness,
 )
-from omsm_ros.core.machine.trajectories import Chirp, StepTest
-from omsm_ros.core.verification.free_path import check_path
+from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.lti.frequency_response import frequency_response
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant, respond
 
 

@@ -5,15 +5,15 @@ import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 from scipy import signal
 
-from omsm_ros.core.departures.families import MODE, VIBRATION
-from omsm_ros.core.departures.other_modes import spread_of_modes
-from omsm_ros.core.dynamics.response_band import response_band
-from omsm_ros.core.fitting.preparation import prepare
-from omsm_ros.core.identification.departure_search import search
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.model_errors.families import MODE, VIBRATION
+from omsm_ros.core.model_errors.undetected import spread_of_modes
+from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 def ringing(participation, frequency, damping, late=LATE):

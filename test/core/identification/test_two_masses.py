@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.dynamics.masses_and_springs import FITTED, TwoMass, fit_two_mass
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.identification.two_masses import table_mass, two_mass_entry
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import assemble
+from omsm_ros.core.identification.identify import identify, table_mass, two_mass_entry
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, record

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.fitting.preparation import prepare
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import lead
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.machine.trajectories import StepTest
-from omsm_ros.core.samples.motion_record import MotionRecord
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD = 1e-3

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.dynamics.calibration import Calibration
-from omsm_ros.core.machine.kinematics import Geometry, workpiece_points
-from omsm_ros.core.machine.trajectories import Spiral
-from omsm_ros.core.registration.alignment import SphereScan, align_on_sphere, sphere_scan_of
-from omsm_ros.core.samples.blocks import AxisBlock
+from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
+from omsm_ros.core.kinematics.trajectories import Spiral
+from omsm_ros.core.registration.probe_alignment import SphereScan, align_on_sphere, sphere_scan_of
+from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.nominal import Sphere
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record

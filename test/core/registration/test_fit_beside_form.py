@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from omsm_ros.core.registration.degrees_of_freedom import Freedoms, Open, root_of, shares_of, widest
 from omsm_ros.core.registration.form_model import (
     GROUP,
     LEAST_LIMIT_M,
@@ -16,9 +17,7 @@ from omsm_ros.core.registration.form_model import (
     most_like,
     relaxed,
 )
-from omsm_ros.core.registration.freedoms import Freedoms, widest
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.registration.pose_budget import Open, root_of, shares_of
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 

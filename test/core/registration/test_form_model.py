@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
 from omsm_ros.core.registration.form_model import Estimate, _unlucky
-from omsm_ros.core.registration.freedoms import parsed_freedoms
 from omsm_ros.core.registration.placement import FREEDOMS, Aperture, Portion
 from omsm_ros.core.registration.register import register
-from omsm_ros.core.surface.freeforms import ZernikeSurface
-from omsm_ros.core.surface.nominal import Sphere
+from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
-from omsm_ros.twin.part_pose import PartPose, posed
+from omsm_ros.twin.part import PartPose, posed
 
 RADIUS = 12.7e-3
 

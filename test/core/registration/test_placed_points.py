@@ -20,9 +20,9 @@ from omsm_ros.core.registration.placement import (
     usable,
 )
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.core.surface.posed import Pose
-from omsm_ros.core.surface.slopes import gradient_of, unit_normal
 from omsm_ros.errors import DataError
 
 RNG = np.random.default_rng(2)

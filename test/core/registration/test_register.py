@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.registration import register as registering
-from omsm_ros.core.registration.freedoms import parsed_freedoms
+from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
 from omsm_ros.core.registration.placement import (
     FREEDOMS,
     Aperture,
@@ -19,12 +19,17 @@ from omsm_ros.core.registration.placement import (
 )
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm, ZernikeSurface
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    Flat,
+    Sphere,
+    XYPolynomial,
+    XYTerm,
+    ZernikeSurface,
+)
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.twin.figure_error import FigureError
-from omsm_ros.twin.part_pose import PartPose, posed
+from omsm_ros.twin.part import FigureError, PartPose, posed
 
 STRAIGHT = Pose()
 RADIUS, NOISE = 12.7e-3, 10e-9

@@ -9,12 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.registration.alignment import (
-    SphereScan,
-    SphereScanReader,
-    align_on_sphere,
-    sphere_scan_of,
-)
 from omsm_ros.core.registration.placement import (
     Aperture,
     Placement,
@@ -22,8 +16,14 @@ from omsm_ros.core.registration.placement import (
     freedom_columns,
     placed,
 )
+from omsm_ros.core.registration.probe_alignment import (
+    SphereScan,
+    SphereScanReader,
+    align_on_sphere,
+    sphere_scan_of,
+)
 from omsm_ros.core.registration.register import register
-from omsm_ros.core.samples.blocks import AxisBlock
+from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import DataError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.registration.freedoms import (
+from omsm_ros.core.registration.degrees_of_freedom import (
     AUTO,
     RIGID,
     Freedoms,

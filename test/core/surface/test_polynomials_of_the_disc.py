@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 from scipy import special
 
-from omsm_ros.core.surface.forbes import bfs_series, con_series, freeform_series
-from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, XYTerm, ZernikeSurface
-from omsm_ros.core.surface.nominal import Sphere
-from omsm_ros.core.surface.q_freeform import QFreeform, QTerm
+from omsm_ros.core.surface.aspheres import bfs_series, con_series, freeform_series
+from omsm_ros.core.surface.nominal import (
+    QBfs,
+    QCon,
+    QFreeform,
+    QTerm,
+    Sphere,
+    XYPolynomial,
+    XYTerm,
+    ZernikeSurface,
+)
 from omsm_ros.core.surface.zernike_terms import (
     NUMBERING,
     Term,

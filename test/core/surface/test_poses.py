@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.freeforms import XYPolynomial, XYTerm
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid, Sphere
+from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    Flat,
+    OffAxisParaboloid,
+    Sphere,
+    XYPolynomial,
+    XYTerm,
+)
 from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
-from omsm_ros.core.surface.slopes import gradient_of, unit_normal
 from omsm_ros.errors import SurfaceError
 
 RNG = np.random.default_rng(5)

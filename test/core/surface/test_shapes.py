@@ -5,11 +5,21 @@ import pytest
 from scipy import optimize
 
 from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
-from omsm_ros.core.surface.freeforms import QBfs, QCon, XYPolynomial, XYTerm, ZernikeSurface
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid, Sphere
+from omsm_ros.core.surface.height_grid import gradient_of
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    Flat,
+    OffAxisParaboloid,
+    QBfs,
+    QCon,
+    QFreeform,
+    QTerm,
+    Sphere,
+    XYPolynomial,
+    XYTerm,
+    ZernikeSurface,
+)
 from omsm_ros.core.surface.posed import OffAxisSection, Pose, PosedSurface, Sum
-from omsm_ros.core.surface.q_freeform import QFreeform, QTerm
-from omsm_ros.core.surface.slopes import gradient_of
 from omsm_ros.errors import SurfaceError
 
 RNG = np.random.default_rng(0)

@@ -3,7 +3,7 @@ import html
 import numpy as np
 import pytest
 
-from omsm_ros.report.campaign.page import Measurement, judge, remarks, render
+from omsm_ros.report.campaign import Measurement, judge, remarks, render
 
 DAY_NS = 86_400 * 10**9
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.frequency_response import FrequencyResponse
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.lti.frequency_response import FrequencyResponse
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.report.certificate import figures as certificate_figures
 
 

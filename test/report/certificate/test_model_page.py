@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.core.sampled.free_run import free_run
-from omsm_ros.core.sampled.model import Discrete, SampledModel
-from omsm_ros.report.certificate.model_figures import response, response_of
+from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel, free_run
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.report.certificate.figures import response, response_of
 from omsm_ros.report.certificate.model_page import (
     ModelPage,
     model_figures_of,

@@ -8,13 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
-from omsm_ros.report.certificate.reading import (
-    hidden_table,
-    mode_table,
-    shape_table,
-    two_mass_table,
-)
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.report.certificate.page import hidden_table, mode_table, shape_table, two_mass_table
 from omsm_ros.report.certificate.tables import order_table
 
 from .certificates import by_name, certified

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from parsed_page import Page
 
-from omsm_ros.core.dynamics.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate.markdown import render_markdown
 from omsm_ros.report.certificate.page import (
@@ -21,7 +22,6 @@ from omsm_ros.report.certificate.page import (
     sections,
     verdict_on_calibration,
 )
-from omsm_ros.report.common import style
 
 from .certificates import ATTACK, bare, by_name, certified, range_detail
 

@@ -6,7 +6,7 @@ import pytest
 from omsm_ros.core.comparison.compare import compare
 from omsm_ros.core.comparison.stated_errors import Measurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.report.difference.figures import profiles
+from omsm_ros.report.difference import profiles
 
 
 @pytest.mark.parametrize(

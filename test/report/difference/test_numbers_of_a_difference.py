@@ -13,7 +13,7 @@ from page_tables import PageTables, says
 from omsm_ros.core.comparison.compare import compare
 from omsm_ros.core.comparison.stated_errors import Measurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.jobs.compare_measurements import facts_of, write_difference
+from omsm_ros.pipelines.compare_measurements import facts_of, write_difference
 from omsm_ros.readable import figure
 
 RADIUS = 5e-3

@@ -12,8 +12,8 @@ import pytest
 from omsm_ros.core.comparison.compare import compare
 from omsm_ros.core.comparison.stated_errors import Measurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.jobs.compare_measurements import facts_of
-from omsm_ros.report.difference.page import CAPTIONS, headlines, map_of, records, render
+from omsm_ros.pipelines.compare_measurements import facts_of
+from omsm_ros.report.difference import CAPTIONS, headlines, map_of, records, render
 
 ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 RADIUS = 5e-3

@@ -10,7 +10,7 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.report.common import style
+from omsm_ros.report import style
 from omsm_ros.report.measurement import figures
 from omsm_ros.twin.plant import Plant
 

@@ -9,9 +9,9 @@ import pytest
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import DataError
-from omsm_ros.report.measurement.cloud_view import CloudView
-from omsm_ros.report.measurement.gallery import surface_figures
+from omsm_ros.report.measurement.figures import surface_figures
 from omsm_ros.report.measurement.page import CAPTIONS, MAPS, PROFILES
+from omsm_ros.report.measurement.surface_map import CloudView
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

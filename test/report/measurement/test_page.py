@@ -10,8 +10,8 @@ import pytest
 from parsed_page import Page
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.report.common.template import typeset
 from omsm_ros.report.measurement.page import CAPTIONS, Report, headlines, render
+from omsm_ros.report.page_parts import typeset
 
 ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from omsm_ros.report.measurement.part import (
+from omsm_ros.report.measurement.page import (
     form_table,
     limits_table,
     provenance_table,

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from omsm_ros.errors import DataError
-from omsm_ros.report.measurement.raster import MAX_PIXELS, distances, rasterise, smoothed
+from omsm_ros.report.measurement.surface_map import MAX_PIXELS, distances, rasterise, smoothed
 
 
 def spiral(points, turns, radius=1e-2):

@@ -4,9 +4,9 @@ import warnings
 
 import numpy as np
 
-from omsm_ros.core.spectra.density import density
-from omsm_ros.report.common import style
-from omsm_ros.report.spectrum.figures import motion
+from omsm_ros.core.ripple.density import density
+from omsm_ros.report import style
+from omsm_ros.report.spectrum import motion
 
 
 def test_an_axis_that_stands_still_is_drawn_without_a_word():

@@ -1,0 +1,253 @@
+"""Commands around a calibration: plan, verify, compare, calset."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import add_bags, add_by_stamps, add_trigger, cell_of, number, trigger_of
+from omsm_ros.cli.command import (
+    Command,
+    Facts,
+    kept_at,
+    progress_bar,
+    rejected,
+    say,
+    say_lines,
+    table,
+    written,
+)
+from omsm_ros.core.calibration.calibration import verdict_of
+from omsm_ros.core.calibration.calibration_set import calibration_set
+from omsm_ros.core.calibration.repeatability import Repeatability, compare, repeatability
+from omsm_ros.core.kinematics.trajectories import (
+    PLANNED_COUNT,
+    PLANNED_DWELL_S,
+    SECOND_SHARE,
+    plan_csv,
+    plan_gcode,
+    plan_steps,
+)
+from omsm_ros.errors import CalibrationError
+from omsm_ros.io.calibration_file import load_calibration, save_calibration
+from omsm_ros.io.files import save_text
+from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
+from omsm_ros.readable import quantity
+from omsm_ros.units import DEGREE_RAD
+
+
+def _declare_verify(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
+    sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
+    add_trigger(sub)
+    add_by_stamps(sub)
+    sub.add_argument(
+        "--find-offset",
+        action="store_true",
+        help="establish the counter offset by the motion itself; use it for --counter-offset",
+    )
+
+
+def _verify(args: argparse.Namespace) -> Facts:
+    calibration, bag = load_calibration(args.calibration), cell_of(args.bag, args)
+    trigger, established = trigger_of(args), None
+    with progress_bar("reading", args.json) as progress:
+        if args.find_offset:
+            established = established_offset(bag, calibration, progress)
+            trigger = replace(trigger, counter_offset=established.samples)
+        check = path_check_of(bag, calibration, progress, trigger, args.by_stamps)
+    bands = [
+        {
+            "from": low,
+            "to": high,
+            "error_before": _rms(check.error_before[inside]),
+            "error_after": _rms(check.error_after[inside]),
+            "lag_before": float(np.mean(check.lag_before[inside])),
+            "lag_after": float(np.mean(check.lag_after[inside])),
+        }
+        for low, high in check.excited
+        if np.any(inside := (check.frequency >= low) & (check.frequency < high))
+    ]
+    facts: Facts = {"rms_before": check.rms_before, "rms_after": check.rms_after, "bands": bands}
+    return facts | ({"counter_offset": asdict(established)} if established else {})
+
+
+def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _show_verify(facts: Facts) -> None:
+    if offset := facts.get("counter_offset"):
+        say(
+            f"counter offset {offset['samples']} samples; left of it "
+            f"{offset['fraction']:.3f} ± {offset['uncertainty']:.3f} (k = 1)"
+        )
+    say("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
+    for band in facts["bands"]:
+        errors = (quantity(band[f"error_{w}"], "m") for w in ("before", "after"))
+        lags = (quantity(band[f"lag_{w}"] / DEGREE_RAD, "°") for w in ("before", "after"))
+        say(f"{band['from']:3.0f}-{band['to']:<3.0f}", *(f"{x:>12}" for x in (*errors, *lags)))
+    say("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
+
+
+def _declare_compare(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("old", type=Path, metavar="OLD.json")
+    sub.add_argument("new", type=Path, metavar="NEW.json")
+    sub.add_argument(
+        "more",
+        type=Path,
+        nargs="*",
+        metavar="MORE.json",
+        help="with three or more: do they scatter as little as they state?",
+    )
+
+
+def _compare(args: argparse.Namespace) -> Facts:
+    calibrations = [load_calibration(path) for path in (args.old, args.new, *args.more)]
+    if len(calibrations) > 2:
+        return _repeatability_facts(repeatability(calibrations))
+    change = compare(*calibrations)
+    return asdict(change) | {"text": change.text()}
+
+
+def _repeatability_facts(found: Repeatability) -> Facts:
+    arrays = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in asdict(found).items()
+    }
+    return arrays | {"text": found.text()}
+
+
+def _declare_plan(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("what", choices=("steps",))
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    for name, kind, default, meaning in (
+        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "of the probe [s]"),
+        ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
+        (
+            "--second-step",
+            quantities.STEP,
+            None,
+            "of every other step [m]; 3/9.8 of --step by default",
+        ),
+        ("--count", quantities.COUNT, PLANNED_COUNT, "steps up and as many down, from the middle"),
+        (
+            "--dwell",
+            quantities.DWELL,
+            PLANNED_DWELL_S,
+            "from edge to edge [s]; four times as long leaves half as much creep unseen",
+        ),
+        ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
+        ("--half-range", quantities.STEP, 50e-6, "of the probe [m]"),
+    ):
+        sub.add_argument(name, type=number(kind), default=default, help=meaning)
+
+
+def _plan(args: argparse.Namespace) -> Facts:
+    plan = plan_steps(
+        sample_period=args.sample_period,
+        step=args.step,
+        second_step=args.second_step or SECOND_SHARE * args.step,
+        count=args.count,
+        dwell=args.dwell,
+        rise=args.rise,
+        half_range=args.half_range,
+    )
+    csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
+    save_text(csv, plan_csv(plan, args.sample_period))
+    save_text(gcode, plan_gcode(plan))
+    return {
+        "edges": len(plan.starts),
+        "heights": sorted(set(map(abs, plan.heights)), reverse=True),
+        "travel": plan.travel,
+        "duration": plan.duration,
+        "rise": plan.rise,
+        "files": {"csv": str(csv), "gcode": str(gcode)},
+    }
+
+
+def _lengths(lengths: Sequence[float]) -> str:
+    return " and ".join(quantity(length, "m") for length in lengths)
+
+
+def _show_plan(facts: Facts) -> None:
+    table(
+        [
+            ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
+            ("travel", _lengths([facts["travel"]])),
+            ("duration", quantity(facts["duration"], "s")),
+            ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
+            written(facts["files"].values()),
+        ]
+    )
+
+
+_PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
+
+
+def _placed(text: str) -> tuple[Path, str, float]:
+    """Return the argument type: CAL.json@x=0.01, a calibration and its place."""
+    found = _PLACED.fullmatch(text)
+    if found is None:
+        raise argparse.ArgumentTypeError(
+            f"{quantities.shown(text)} has no place, expected such as CAL.json@x=0.01 (x, z or b)"
+        )
+    kind = quantities.TABLE_ANGLE if found["axis"] == "b" else quantities.POSITION
+    return Path(found["path"]), found["axis"], number(kind)(found["position"])
+
+
+def _declare_calset(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "placed", type=_placed, nargs="+", metavar="CAL.json@x=POSITION",
+        help="calibrations and where they were made: x or z in metres, b in radians",
+    )  # fmt: skip
+    sub.add_argument("--out", type=Path, required=True, metavar="SET.json")
+
+
+def _calset(args: argparse.Namespace) -> Facts:
+    axes = sorted({axis for _, axis, _ in args.placed})
+    if len(axes) > 1:
+        raise CalibrationError(f"a set along {' and '.join(axes)}, expected one axis; make two")
+    placed = [(position, load_calibration(path)) for path, _, position in args.placed]
+    made = calibration_set(axes[0], placed)
+    verdict, reasons = verdict_of(made)
+    path = kept_at(args.out, verdict)
+    save_calibration(path, made)
+    return {
+        "along": made.along,
+        "positions": list(made.positions),
+        "lags": [member.dynamics.low_frequency_delay for member in made.members],
+        "valid_up_to": made.valid_up_to,
+        "verdict": verdict,
+        "reasons": reasons,
+        "calibration": str(path),
+    }
+
+
+def _show_calset(facts: Facts) -> None:
+    unit = "rad" if facts["along"] == "b" else "m"
+    table(
+        [
+            *(
+                (f"at {facts['along']} = {quantity(place, unit)}", f"lag {quantity(lag, 's', 4)}")
+                for place, lag in zip(facts["positions"], facts["lags"], strict=True)
+            ),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+            ("verdict", facts["verdict"] or "none"),
+            written([facts["calibration"]]),
+        ]
+    )
+
+
+COMMANDS = (
+    Command("plan", _declare_plan, _plan, _show_plan),
+    Command("verify", _declare_verify, _verify, _show_verify),
+    Command("compare", _declare_compare, _compare, lambda facts: say_lines(facts["text"])),
+    Command("calset", _declare_calset, _calset, _show_calset, rejected),
+)

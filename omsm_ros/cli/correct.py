@@ -1,0 +1,263 @@
+"""Commands around a scan: predict, correct."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import (
+    TABLE_SUFFIX,
+    add_bags,
+    add_by_stamps,
+    add_polarity,
+    add_trigger,
+    cell_of,
+    json_object,
+    number,
+    refuse_cell,
+    trigger_of,
+)
+from omsm_ros.cli.command import Command, Facts, declare_catalogue, progress_bar, table, written
+from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
+from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
+from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.kinematics.limits import FASTEST, MachineLimits
+from omsm_ros.core.kinematics.scan_path import ScanPath
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.calibration_file import load_calibration
+from omsm_ros.io.descriptions import (
+    load_geometry,
+    load_limits,
+    load_motion,
+    load_pitch,
+    load_sources,
+    load_surface,
+)
+from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
+from omsm_ros.pipelines.correct import Admission, ByStamps
+from omsm_ros.pipelines.history import remembered
+from omsm_ros.pipelines.measure import Registering, measure
+from omsm_ros.pipelines.recording import path_in
+from omsm_ros.readable import percent, plain, quantity
+
+CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
+
+
+def sources_of(text: str | None) -> MachineSources:
+    """Return what is uncertain of the machine: from a file, or from JSON that stands there."""
+    if text is None:
+        return MachineSources()
+    if text.lstrip().startswith("{"):
+        return declared_sources(json_and_yaml.object_of(text, ConfigurationError, "--sources"))
+    return load_sources(text)
+
+
+def geometry_of(path: Path | None) -> Geometry:
+    """Return the probe's place from a file, or none but zeros without one."""
+    return load_geometry(path) if path else Geometry()
+
+
+def _declare_correct(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "bag")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
+    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
+    sub.add_argument(
+        "--pitch",
+        type=Path,
+        metavar="PITCH.csv",
+        help="of Z, measured: columns z_m,pitch_rad; needs abbe_arm in the geometry",
+    )
+    sub.add_argument(
+        "--lateral-lag", type=number(quantities.LAG), help="of the probe against X and C [s]"
+    )
+    _declare_uncertain(sub)
+    sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
+    add_by_stamps(sub)
+    sub.add_argument(
+        "--delay",
+        type=number(quantities.STAMP_DELAY),
+        default=0.0,
+        help="from the probe's stamp to its exposure [s]",
+    )
+    sub.add_argument(
+        "--exposure", type=number(quantities.EXPOSURE), default=0.0, help="of the probe [s]"
+    )
+    add_trigger(sub)
+    sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
+    add_polarity(sub)
+    sub.add_argument(
+        "--override", action="store_true", help="use a calibration that does not belong; recorded"
+    )
+    declare_fit(sub, None)
+    declare_tolerance(sub)
+    declare_catalogue(sub)
+
+
+def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--sources",
+        metavar="SOURCES.yaml",
+        help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
+    )
+    sub.add_argument(
+        "--accuracy",
+        type=number(quantities.BUDGET),
+        help="asked for, k = 2 [m]: what the traffic light is held against",
+    )
+    sub.add_argument(
+        "--lateral",
+        type=number(quantities.UNCERTAINTY),
+        default=0.0,
+        help="standard uncertainty of x and y [m]",
+    )
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise ConfigurationError for options that need others."""
+    if args.fit and args.nominal is None:
+        raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
+    if args.lateral and args.nominal is None:
+        raise ConfigurationError(
+            "--lateral costs height by the slope of the surface; give --nominal SURFACE.yaml"
+        )
+    if args.tolerance and not args.fit:
+        raise ConfigurationError("--tolerance needs a deviation to judge; give --fit auto")
+    if args.aperture and not args.fit:
+        raise ConfigurationError("--aperture is the disc that is fitted; give --fit auto")
+    if (args.delay or args.exposure) and not args.by_stamps:
+        raise ConfigurationError(
+            "--delay and --exposure shift stamps, which counters do without; give --by-stamps, or "
+            "leave them out"
+        )
+
+
+def _correct(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    nominal = load_surface(args.nominal) if args.nominal else None
+    _check_options(args)
+    options = CorrectionOptions(
+        polarity=args.polarity,
+        accept_other_rate=args.override,
+        lateral_lag=args.lateral_lag,
+        geometry=geometry_of(args.geometry),
+        pitch=load_pitch(args.pitch) if args.pitch else None,
+        trigger=trigger_of(args),
+    )
+    if options.pitch is not None and not options.geometry.abbe_arm:
+        raise ConfigurationError(
+            "--pitch without an Abbe arm does nothing; give abbe_arm in --geometry GEOMETRY.yaml"
+        )
+    with (
+        result_folder(args.out, MEASUREMENT_FILES) as out,
+        progress_bar("correcting", args.json) as progress,
+    ):
+        summary = measure(
+            cell_of(args.bag, args),
+            calibration,
+            out,
+            nominal=nominal,
+            options=options,
+            admission=Admission(args.settings, args.override),
+            lateral=args.lateral,
+            by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
+            stated=sources_of(args.sources),
+            accuracy=args.accuracy,
+            register=Registering(args.fit, args.aperture, args.tolerance) if args.fit else None,
+            report=not args.no_report,
+            progress=progress,
+        )
+    warnings = remembered(args.catalogue, lambda: _keep(args))
+    warnings = [*summary["warnings"], *warnings]
+    return {**summary, "warnings": warnings, "out": str(args.out)}
+
+
+def _keep(args: argparse.Namespace) -> bool:
+    from omsm_ros.pipelines.history import keep_measurement
+
+    return keep_measurement(args.catalogue, args.out, args.bag)
+
+
+def _show_correct(summary: Facts) -> None:
+    rows = []
+    for stream, account in summary["samples"].items():
+        reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
+        text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
+        rows.append((stream, text))
+    if light := summary.get("light"):  # without one corrected sample there is none
+        rows.append((light["level"], light["word"]))
+        rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
+    rows += [("warning", text) for text in summary.get("warnings", [])]
+    if "form" in summary:
+        rows += form_rows(summary["form"])
+    table([*rows, written(summary["files"].values(), summary["out"])])
+
+
+def _declare_predict(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "motion", help="a bag, or a planned motion as CSV time_s,z_m")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument(
+        "--budget",
+        type=number(quantities.BUDGET),
+        default=DEFAULT_BUDGET_M,
+        help="allowed residual, k = 2 [m]",
+    )
+    sub.add_argument(
+        "--limits",
+        type=Path,
+        metavar="LIMITS.yaml",
+        help="of servo, probe, spindle and axes, as config/limits.yaml; default: the paper's",
+    )
+
+
+def _predict(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    if args.motion.suffix.lower() == TABLE_SUFFIX:
+        refuse_cell(args.motion, args)
+        z, period = load_motion(args.motion)
+        path = ScanPath(z=z, sample_period=period)
+    else:
+        with progress_bar("reading", args.json) as progress:
+            path = path_in(cell_of(args.motion, args), progress)
+    limits = load_limits(args.limits) if args.limits else MachineLimits()
+    return asdict(predict_error(calibration, path, args.budget, limits))
+
+
+def _show_predict(facts: Facts) -> None:
+    table(
+        [
+            ("verdict", "safe" if facts["safe"] else "NOT safe"),
+            ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
+                              f"{quantity(facts['rms'], 'm', 4)} rms"),
+            ("left after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
+            ("motion outside the band", percent(facts["outside_band_fraction"])),
+            ("may run faster by", f"{_times(facts['speed_factor'])}, bound by {facts['binding']}"),
+            *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
+            ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
+            ("because", facts["message"]),
+        ]
+    )  # fmt: skip
+
+
+def _limit_text(limit: Mapping[str, Any]) -> str:
+    value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
+    faster = _times(limit["speed_factor"])
+    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, {faster} as fast"
+
+
+def _times(factor: float) -> str:
+    return f"{plain(factor)}{' or more' if factor >= FASTEST else ''} times"
+
+
+COMMANDS = (
+    Command("predict", _declare_predict, _predict, _show_predict),
+    Command("correct", _declare_correct, _correct, _show_correct),
+)

@@ -1,0 +1,136 @@
+"""Commands about what was calibrated and measured before: history."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omsm_ros.cli.command import Command, Facts, declare_catalogue, say, table, written
+from omsm_ros.core.calibration.trend import Trend
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.json_and_yaml import unknown_as_null
+from omsm_ros.quantities import shown
+from omsm_ros.readable import NOTHING, count, measured, plain, quantity
+from omsm_ros.units import DAY_S
+
+if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
+    from omsm_ros.pipelines.history import MachineHistory
+
+_SHOWN_ROWS = 20
+_MOST_DRAWN = 30
+_USUAL = "catalogue.sqlite"
+_NO_NAME = """(no machine named; identify and correct with --settings '{"machine": "…"}')"""
+
+
+def _declare_history(sub: argparse.ArgumentParser) -> None:
+    declare_catalogue(sub)
+    sub.add_argument("--machine", default="", help="this one only")
+    sub.add_argument(
+        "--add", type=Path, nargs="+", default=[], metavar="CAL.json|DIR", help="made earlier"
+    )
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="lag, gain and form over time")
+
+
+def _history(args: argparse.Namespace) -> Facts:
+    from omsm_ros.pipelines.history import history, keep
+
+    address = args.catalogue or _USUAL
+    if not args.catalogue and not args.add and not Path(_USUAL).exists():
+        raise ConfigurationError(
+            f"no catalogue is named, and there is no {_USUAL!r} here; give --catalogue, set "
+            "OMSM_CATALOGUE, or begin one with --add"
+        )
+    if not args.add and "://" not in address and not Path(address).exists():
+        raise ConfigurationError(
+            f"no catalogue at {shown(address)}; check the path, or begin one with --add"
+        )
+    added = sum(keep(address, path) for path in args.add)
+    found = history(address, args.machine)
+    if args.plot is not None:
+        from omsm_ros.io.files import save_bytes
+        from omsm_ros.report.campaign import draw
+
+        if len(found.machines) > _MOST_DRAWN:
+            raise ConfigurationError(
+                f"--plot of {count(len(found.machines))} machines, expected {_MOST_DRAWN} at most; "
+                "choose one with --machine"
+            )
+        save_bytes(args.plot, draw(found.machines))
+    return {
+        "catalogue": address.rpartition("@")[2],
+        "added": added,
+        **({"figure": str(args.plot)} if args.plot is not None else {}),
+        "older": found.older,
+        "machines": [_plain(machine) for machine in found.machines],
+    }
+
+
+def _plain(machine: MachineHistory) -> dict[str, Any]:
+    """Return a machine for JSON, its times as text."""
+    # Not asdict() of the whole, which would copy every value of every row.
+    facts = {field.name: getattr(machine, field.name) for field in fields(machine)}
+    facts = {name: asdict(part) if is_dataclass(part) else part for name, part in facts.items()}
+    for rows in (machine.calibrations, machine.measurements):
+        for row in rows:
+            for name in ("recorded_at", "added_at"):
+                row[name] = row[name] and row[name].isoformat(timespec="seconds")
+    plain = unknown_as_null(facts)
+    assert plain is not None
+    return plain
+
+
+def _show_history(facts: Facts) -> None:
+    if not facts["machines"]:
+        say(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
+    for machine in facts["machines"]:
+        say(machine["machine"] or _NO_NAME)
+        for row in machine["calibrations"][-_SHOWN_ROWS:]:
+            say(
+                f"  {_when(row)}  calibration {row['id'][:8]}  "
+                f"lag {measured(row['delay'], row['delay_uncertainty'], 's')}  "
+                f"gain {plain(row['static_gain'], 6)}  {row['verdict']}"
+            )
+        for row in machine["measurements"][-_SHOWN_ROWS:]:
+            say(
+                f"  {_when(row)}  {Path(row['bag']).name}  "
+                f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
+            )
+        table(
+            [
+                ("  calibrations, measurements", _counts(machine)),
+                ("  lag drifts a day", _drift(machine["delay"], "s")),
+                ("  static gain drifts a day", _drift(machine["static_gain"], "")),
+                ("  form's rms drifts a day", _drift(machine["deviation"], "m")),
+            ]
+        )
+    if facts["older"]:
+        say(
+            f"{count(facts['older'])} older calibrations and measurements are not listed here, "
+            "nor in the drifts; --machine lists one machine"
+        )
+    if "figure" in facts:
+        table([written([facts["figure"]])])
+
+
+def _when(row: dict[str, Any]) -> str:
+    """Return when a row was recorded; where its recording has no date, when it was written down."""
+    return f"{row['recorded_at']} UTC" if row["recorded_at"] else f"added {row['added_at']} UTC"
+
+
+def _counts(machine: dict[str, Any]) -> str:
+    return f"{count(len(machine['calibrations']))}, {count(len(machine['measurements']))}"
+
+
+def _drift(found: dict[str, float] | None, unit: str) -> str:
+    if found is None:
+        return f"{NOTHING} (not evaluated: fewer than five, or no times)"
+    drift = Trend(**found)
+    low, high = (
+        quantity(s * DAY_S, unit) if unit else plain(s * DAY_S) for s in (drift.low, drift.high)
+    )
+    return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
+
+
+COMMANDS = (Command("history", _declare_history, _history, _show_history),)

@@ -1,0 +1,77 @@
+"""The command that looks into a bag, and saves what is whole of a damaged one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from omsm_ros.cli.arguments import add_bags, cell_of
+from omsm_ros.cli.command import Command, Facts, progress_bar, say, table, written
+from omsm_ros.pipelines.inspect_bag import Inspection, inspect_bag
+from omsm_ros.readable import quantity
+
+
+def _declare(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "bag")
+    sub.add_argument(
+        "--repair",
+        action="store_true",
+        help="copy what is whole of an MCAP bag to <bag>.repaired.mcap; the bag stays as it is",
+    )
+
+
+def _act(args: argparse.Namespace) -> Facts:
+    if args.repair:
+        return _repaired(args.bag)
+    with progress_bar("reading", args.json) as progress:
+        found: Inspection = inspect_bag(cell_of(args.bag, args), progress)
+    return {"bag": str(args.bag), **found.entry()}
+
+
+def _repaired(bag: Path) -> Facts:
+    from omsm_ros.io.bag_repair import repair  # seldom needed, slow to load
+
+    made = repair(bag)
+    return {
+        "bag": str(bag),
+        "repaired": str(made.path),
+        "messages": dict(made.messages),
+        "lost": made.lost,
+        "lost_unnamed": made.unnamed,
+    }
+
+
+def _show(facts: Facts) -> None:
+    if "repaired" in facts:
+        saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
+        lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
+        if more := facts["lost_unnamed"]:
+            lost.append(("lost", f"and {more} more places"))
+        table([written([facts["repaired"]]), *saved, *lost])
+        return
+    row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
+    names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
+    say(row.format(rate="rate Hz", **{name: name for name in names}))
+    for topic in facts["topics"]:
+        period = topic["sample_period"]
+        say(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
+    faults = [("fault", text) for text in facts["faults"]] or [("faults", "none found")]
+    table([*_vibration(facts["vibration"]), *faults])
+
+
+def _vibration(found: Facts | None) -> list[tuple[str, str]]:
+    """Largest levels by band, as the vibration monitor told them."""
+    if found is None:
+        return []
+    rows = []
+    for place, (low, high) in enumerate(found["bands"]):
+        levels = ", ".join(f"{a} {quantity(v[place], 'm/s²')}" for a, v in found["rms"].items())
+        effect = quantity(found["height"][place], "m") if found["height"] else "not evaluated"
+        rows.append((f"{low:g} to {high:g} Hz", f"at most {levels}; on a height {effect} rms"))
+    total = found["height_total"]
+    said = "not evaluated: no calibration" if total is None else f"{quantity(total, 'm')} rms"
+    raised = f"alarm in {found['alarms']} of {found['spectra']} spectra"
+    return [("vibration", f"on a height at most {said}; {raised}"), *rows]
+
+
+COMMANDS = (Command("inspect", _declare, _act, _show),)

@@ -1,0 +1,222 @@
+"""Commands that divide a lag into structure and latency: selfcal, reversal, latency."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
+from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table, written
+from omsm_ros.cli.correct import CALIBRATION
+from omsm_ros.core.adjustment.resolved_calibration import undetermined
+from omsm_ros.core.adjustment.self_calibration import (
+    DEFAULT_CLOCKING_RAD,
+    DEFAULT_HARMONICS,
+    WIDE_GAIN,
+)
+from omsm_ros.core.calibration.calibration import (
+    Calibration,
+    beyond_lag,
+    declared,
+    latency_of,
+    verdict_of,
+    with_latency,
+)
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.calibration_file import load_calibration, save_calibration
+from omsm_ros.pipelines.study_scans import SelfCalibrationOptions, reversal_of, self_calibration_of
+from omsm_ros.readable import measured, percent, quantity
+from omsm_ros.units import RPM_RAD_S
+
+
+def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more of one part")
+    sub.add_argument("--calibration", type=Path, metavar="STEP.json", help="from a step test")
+    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+    sub.add_argument(
+        "--harmonics",
+        type=number(quantities.HARMONICS),
+        default=DEFAULT_HARMONICS,
+        help="highest of the surface in a turn",
+    )
+    sub.add_argument(
+        "--clocking",
+        type=number(quantities.ANGLE_UNCERTAINTY),
+        default=DEFAULT_CLOCKING_RAD,
+        help="standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
+    )
+    add_polarity(sub)
+    sub.add_argument(
+        "--static-gain",
+        type=number(quantities.GAIN),
+        default=1.0,
+        help="of the probe, without a step test",
+    )
+    sub.add_argument(
+        "--gain-uncertainty",
+        type=number(quantities.GAIN_UNCERTAINTY),
+        default=WIDE_GAIN,
+        help="standard, as a share of it",
+    )
+    sub.add_argument(
+        "--settings", type=json_object, default={}, metavar="JSON", help="without a step test"
+    )
+
+
+def _selfcal(args: argparse.Namespace) -> Facts:
+    step_test = load_calibration(args.calibration) if args.calibration else None
+    options = SelfCalibrationOptions(
+        harmonics=args.harmonics,
+        clocking=args.clocking,
+        polarity=args.polarity,
+        static_gain=args.static_gain,
+        gain_uncertainty=args.gain_uncertainty,
+        settings=args.settings,
+    )
+    with progress_bar("reading", args.json) as progress:
+        bags = [cell_of(path, args) for path in args.scans]
+        found, made, accounts = self_calibration_of(bags, step_test, options, progress)
+    path = _kept(args.out, made)
+    return {
+        **_resolved_facts(made),
+        "residual": found.residual,
+        "left_on_this_surface": found.followed,
+        "disagreement": found.agreement.disagreement,
+        "not_told": undetermined(found),
+        "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
+        "samples": [account.as_dict() for account in accounts],
+        "calibration": str(path),
+    }
+
+
+def _kept(out: Path, calibration: Calibration) -> Path:
+    """Write the calibration, and return where."""
+    path = kept_at(out, verdict_of(calibration)[0])
+    save_calibration(path, calibration)
+    return path
+
+
+def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
+    verdict, reasons = verdict_of(calibration)
+    spread = calibration.certificate.get("low_frequency_delay_uncertainty_s")
+    return {
+        "id": calibration.id,
+        "verdict": verdict,
+        "reasons": reasons,
+        "lag": calibration.dynamics.low_frequency_delay,
+        "lag_uncertainty": spread,
+        "latency": latency_of(calibration).entry(),
+        "valid_up_to": calibration.valid_up_to,
+    }
+
+
+def _show_selfcal(facts: Facts) -> None:
+    table(
+        [
+            ("verdict", facts["verdict"]),
+            *(("reason", text) for text in facts["reasons"]),
+            ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
+            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            *_latency_rows(facts["latency"]),
+            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+            ("left on this surface", f"{quantity(facts['left_on_this_surface'], 'm')} rms (k = 1)"),
+            ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
+            *(("not determined", text) for text in facts["not_told"]),
+            written([facts["calibration"]]),
+        ]
+    )  # fmt: skip
+
+
+def _time(seconds: float, spread: float | None) -> str:
+    stated = measured(seconds, spread, "s")
+    return f"{stated} ± unknown" if spread is None else f"{stated} (k = 1)"
+
+
+def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
+    share = latency["share"]
+    return [
+        ("of it latency", _time(latency["delay_s"], latency["uncertainty_s"])),
+        ("share", "not known" if share is None else percent(share, 3)),
+        ("by", f"{latency['source']}: {latency['reason']}"),
+    ]
+
+
+def _declare_reversal(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "clockwise", "counterclockwise")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument("--out", type=Path, metavar="CAL.json", help="with the latency in it")
+
+
+def _reversal(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    with progress_bar("correcting", args.json) as progress:
+        bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
+        found, accounts = reversal_of(bags, calibration, progress)
+    facts = {
+        name: getattr(found, name)
+        for name in ("lag", "uncertainty", "lag_of_z", "residual", "used", "latency")
+    }
+    facts["points"] = sum(account.axes.corrected for account in accounts)
+    facts["samples"] = [account.as_dict() for account in accounts]
+    if args.out:
+        facts["calibration"] = str(_kept(args.out, found.calibration))
+    return facts
+
+
+_MEANINGS = {
+    True: "the probe is late: X and C must be delayed too",
+    False: "the lag is mechanical, in Z only",
+    None: "not decided: it is neither zero nor the lag of Z",
+}
+
+
+def _show_reversal(facts: Facts) -> None:
+    table(
+        [
+            ("lateral lag", _time(facts["lag"], facts["uncertainty"])),
+            ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
+            ("meaning", _MEANINGS[facts["latency"]]),
+            ("residual", f"{quantity(facts['residual'], 'm')} rms"),
+            ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
+            written([facts.get("calibration", "nowhere; give --out to use it")]),
+        ]
+    )
+
+
+def _declare_latency(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("calibration", type=Path, metavar="CAL.json")
+    delay, spread = number(quantities.LAG), number(quantities.TIME_UNCERTAINTY)
+    sub.add_argument("--delay", type=delay, required=True, help="of the probe [s]; 0 for none")
+    sub.add_argument("--uncertainty", type=spread, required=True, help="standard, k = 1 [s]")
+    sub.add_argument("--reason", required=True, help="where the figure comes from")
+    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+
+
+def _latency(args: argparse.Namespace) -> Facts:
+    calibration = load_calibration(args.calibration)
+    lag = calibration.dynamics.low_frequency_delay
+    if (wrong := beyond_lag(calibration, args.delay, args.uncertainty)) is not None:
+        raise ConfigurationError(wrong)
+    latency = declared(lag, args.delay, args.uncertainty, args.reason)
+    made = with_latency(calibration, latency)
+    path = _kept(args.out, made)
+    return {**_resolved_facts(made), "calibration": str(path)}
+
+
+def _show_latency(facts: Facts) -> None:
+    table(
+        [
+            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            *_latency_rows(facts["latency"]),
+            written([facts["calibration"]]),
+        ]
+    )
+
+
+COMMANDS = (
+    Command("selfcal", _declare_selfcal, _selfcal, _show_selfcal, rejected),
+    Command("reversal", _declare_reversal, _reversal, _show_reversal),
+    Command("latency", _declare_latency, _latency, _show_latency, rejected),
+)

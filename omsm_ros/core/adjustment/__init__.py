@@ -1,0 +1,1 @@
+"""Several scans of one part, evaluated together."""

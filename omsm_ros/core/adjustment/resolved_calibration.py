@@ -1,0 +1,374 @@
+"""A calibration from scans of one part, with or without a step test before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from omsm_ros.core.adjustment.scan_model import CURVATURE, DYNAMIC, GAIN, LAG, LATENCY, OWN
+from omsm_ros.core.adjustment.scan_reader import ScanColumns
+from omsm_ros.core.adjustment.self_calibration import (
+    DEFAULT_HARMONICS,
+    WIDE_CURVATURE_S2,
+    WIDE_GAIN,
+    WIDE_S,
+    Prior,
+    SelfCalibration,
+    self_calibrate,
+)
+from omsm_ros.core.calibration.calibration import (
+    ENTRY,
+    REJECTED,
+    REVERSAL,
+    SPEEDS,
+    Calibration,
+    Latency,
+    share_of,
+)
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, ResponseLimits
+from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import DataError
+from omsm_ros.readable import plain, quantity
+from omsm_ros.units import RPM_RAD_S
+
+SCOPE = (
+    "identified on a surface that Z follows, where latency leaves no trace: the response is that "
+    "of the structure, for surfaces followed as closely; a step test would determine the latency"
+)
+# One clean run in a thousand.
+_SURPRISE_P, _SURPRISE_SIGMAS = 1e-3, 3.0
+# A spindle keeps its speed to better than that.
+_SAME_SPEED = 0.01
+# The low-order model's own poles, well above what moved and well below Nyquist.
+_POLE_SHARE_OF_RATE = 0.2
+
+
+def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibration:
+    """Return the calibration that corrects nothing, for data of ``sample_period`` [s]."""
+    nothing = TransferFunction(np.ones(1), np.ones(1))
+    return Calibration(
+        dynamics=nothing,
+        static_gain=static_gain,
+        sample_period=sample_period,
+        valid_up_to=0.5 / sample_period,
+        covariance=np.zeros((2, 2)),
+        certificate={"verdict": "accepted"},
+    )
+
+
+def without_step_test(gain_uncertainty: float = WIDE_GAIN) -> Prior:
+    """Return what is known of a machine that was never tested: next to nothing.
+
+    gain_uncertainty: of the static gain, as a share of it
+    """
+    return Prior(np.diag([WIDE_S, WIDE_CURVATURE_S2, gain_uncertainty, WIDE_S]) ** 2)
+
+
+def after_step_test(calibration: Calibration) -> Prior:
+    """Return what a step test leaves open: its lag, curvature and gain within its covariance."""
+    jacobian = slow_motion_jacobian(calibration.dynamics)
+    covariance = np.zeros((DYNAMIC, DYNAMIC))
+    covariance[:GAIN, :GAIN] = jacobian @ calibration.covariance @ jacobian.T
+    relative = calibration.static_gain_uncertainty / calibration.static_gain
+    covariance[GAIN, GAIN] = relative**2
+    covariance[LATENCY, LATENCY] = WIDE_S**2
+    return Prior(covariance)
+
+
+def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
+    """Return ``calibration`` with what the scans corrected with it add to it.
+
+    What they say of lag and curvature narrows the covariance Σ of all parameters: with J the
+    Jacobian of the two, and K = Σ Jᵀ (J Σ Jᵀ)⁻¹, to ``Σ - K (J Σ Jᵀ - P) Kᵀ``, P what is left.
+    """
+    g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
+    jacobian = slow_motion_jacobian(g)
+    prior = jacobian @ sigma @ jacobian.T
+    gain = sigma @ jacobian.T @ _inverse_of_what_varies(prior)
+    remaining = found.covariance[:GAIN, :GAIN].copy()
+    if len(g.numerator) <= CURVATURE + 1:
+        # A numerator of the first degree has no room for the curvature: it stays, and counts.
+        remaining[CURVATURE, CURVATURE] += float(found.values[CURVATURE]) ** 2
+    change = prior - remaining
+    covariance = sigma - gain @ change @ gain.T
+    lag = g.low_frequency_delay
+    certificate = {
+        **calibration.certificate,
+        **_entries(found),
+        ENTRY: _latency(found, lag).entry(),
+        "low_frequency_delay_s": lag,
+        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
+    }
+    return replace(
+        calibration,
+        dynamics=g,
+        covariance=(covariance + covariance.T) / 2,
+        certificate=_judged(certificate, found),
+    )
+
+
+def from_scans_alone(
+    found: SelfCalibration,
+    sample_period: float,
+    static_gain: float,
+    settings: Mapping[str, object],
+) -> Calibration:
+    """Return a calibration of low order from scans corrected with :func:`unit_calibration`.
+
+    ``N/D e^{-τs}`` with two fast poles, an octave apart, and N such that the lag and the curvature
+    are those found.
+    """
+    latency = max(float(found.values[LATENCY]), 0.0)
+    total, curvature = float(found.values[LAG]), float(found.values[CURVATURE])
+    lag = total - latency
+    curvature += latency**2 / 2 - total * latency
+    slow = sample_period / (2 * np.pi * _POLE_SHARE_OF_RATE)
+    first, second = 1.5 * slow, 0.5 * slow**2
+    denominator = np.array([1.0, first, second])
+    numerator = np.array([1.0, first - lag, second - first * lag + curvature])
+    by_found = np.zeros((6, DYNAMIC))
+    by_found[1] = [-1, 0, 0, 1]
+    by_found[2] = [-first - latency, 1, 0, first + latency - total]
+    by_found[5, LATENCY] = 1.0
+    dynamics = TransferFunction(numerator, denominator, latency)
+    trusted = min(_highest_excited(found), 0.5 / sample_period)
+    certificate: dict[str, object] = {
+        **_entries(found),
+        "static_gain": static_gain,
+        "static_gain_uncertainty": float(np.sqrt(found.covariance[GAIN, GAIN])) * static_gain,
+        ENTRY: _latency(found, dynamics.low_frequency_delay).entry(),
+        "noise_m": found.agreement.noise,
+        "low_frequency_delay_s": dynamics.low_frequency_delay,
+        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
+        "warnings": [] if found.known[LATENCY] else [SCOPE],
+        "reasons": _early(total, float(np.sqrt(found.covariance[LAG, LAG]))),
+        "verdict": f"accepted up to {quantity(trusted, 'Hz')}",
+    }
+    return Calibration(
+        dynamics=dynamics,
+        static_gain=static_gain,
+        sample_period=sample_period,
+        valid_up_to=trusted,
+        covariance=by_found @ found.covariance @ by_found.T,
+        settings=settings,
+        certificate=_judged(certificate, found),
+    )
+
+
+def _moved(
+    calibration: Calibration, lag: float, curvature: float
+) -> tuple[TransferFunction, FloatArray]:
+    """Return G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
+
+    Only the numerator changes, so the poles stay where they are. It grows to the first degree
+    where the denominator allows it, to hold the lag, and no further, to stay a small model.
+    """
+    g = calibration.dynamics
+    degree = len(g.numerator) - 1
+    wanted = min(max(degree, 1), len(g.denominator) - 1)
+    grown = [0.0] * (wanted - degree)
+    numerator = np.append(g.numerator, grown)
+    factor = np.array([1.0, -lag, curvature])[: min(wanted, 2) + 1]
+    numerator[: len(factor)] = np.convolve(numerator, factor)[: len(factor)]
+    covariance = calibration.covariance
+    for _ in grown:
+        covariance = np.insert(np.insert(covariance, degree + 1, 0.0, 0), degree + 1, 0.0, 1)
+    delay = g.delay if wanted else max(g.delay + lag, 0.0)
+    return TransferFunction(numerator, g.denominator, delay), covariance
+
+
+def _latency(found: SelfCalibration, lag: float) -> Latency:
+    source = REVERSAL if _same(np.abs(found.speeds)) else SPEEDS
+    _, structure = found.structure
+    # What the lag of Z, in the covariance of the dynamics, does not hold already.
+    beside = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
+    if not found.known[LATENCY]:
+        return Latency(
+            delay_s=0.0,
+            uncertainty_s=None,
+            beside_z_s=beside,
+            share=None,
+            source=source,
+            reason=SCOPE,
+        )
+    delay = max(float(found.values[LATENCY]), 0.0)
+    rpm = ", ".join(f"{speed / RPM_RAD_S:.4g}" for speed in found.speeds)
+    return Latency(
+        delay_s=delay,
+        uncertainty_s=float(np.sqrt(found.covariance[LATENCY, LATENCY])),
+        beside_z_s=beside,
+        share=share_of(delay, lag),
+        source=source,
+        reason=f"{len(found.speeds)} scans of one part at {rpm} rpm",
+    )
+
+
+def _same(speeds: FloatArray) -> bool:
+    return bool(np.ptp(speeds) < _SAME_SPEED * np.max(speeds))
+
+
+def _entries(found: SelfCalibration) -> dict[str, object]:
+    return {
+        "self_calibration": {
+            "speeds_rad_s": list(found.speeds),
+            "points": found.points,
+            "residual_rms_m": found.residual,
+            "left_on_this_surface_m": found.followed,
+            "agreement": asdict(found.agreement),
+            "surprise_chi2": found.surprise,
+            "between_scans": [
+                {
+                    name: {"value": float(value), "uncertainty": float(spread)}
+                    for name, value, spread in zip(OWN, values, spreads, strict=True)
+                }
+                for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
+            ],
+            "not_told": undetermined(found),
+        },
+    }
+
+
+def undetermined(found: SelfCalibration) -> list[str]:
+    """Return what the scans did not determine, why, and what would."""
+    words = []
+    if not found.known[LATENCY]:
+        words.append(
+            "latency: where Z follows the surface it leaves no trace; a step test "
+            "(--calibration) together with these scans determines it"
+        )
+    if not found.known[CURVATURE]:
+        words.append(
+            "curvature of the gain: the scans run equally fast, so it passes for the surface; "
+            "scan at another speed"
+        )
+    words.append(
+        "a gain common to all speeds: it scales the surface in every scan alike; only a "
+        "reference determines it"
+    )
+    return words
+
+
+def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:
+    """Return the certificate with the scans' own reasons for and against."""
+    reasons = []
+    if not found.agreement.holds:
+        reasons.append(
+            f"the scans contradict each other by {quantity(found.agreement.disagreement, 'm')} "
+            f"rms, {plain(found.agreement.ratio, 2)} times what noise explains; the part moved, or "
+            "something else than speed changed between them: let the machine settle and repeat"
+        )
+    if stats.chi2.sf(found.surprise, GAIN) < _SURPRISE_P:
+        shift = quantity(float(found.values[LAG]), "s")
+        reasons.append(
+            f"scans and step test contradict each other: the lag would have to change by "
+            f"{shift}, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
+            "repeat the step test with the settings of the scans"
+        )
+    latency, spread = (
+        float(v) for v in (found.values[LATENCY], found.covariance[LATENCY, LATENCY])
+    )
+    if latency < -_SURPRISE_SIGMAS * np.sqrt(spread):
+        reasons.append(
+            f"the probe would have to be {quantity(-latency, 's')} early: the structure "
+            "lags more in the scans than in the step test; repeat the step test"
+        )
+    before = certificate.get("reasons")
+    all_reasons = [*(before if isinstance(before, list) else []), *reasons]
+    if not all_reasons:
+        return certificate
+    return certificate | {"reasons": all_reasons, "verdict": REJECTED}
+
+
+def _early(lag: float, uncertainty: float) -> list[str]:
+    """Return the reason against scans alone whose Z would have to follow the probe."""
+    if lag >= -_SURPRISE_SIGMAS * uncertainty:
+        return []
+    return [
+        f"Z would have to move {quantity(-lag, 's')} after what the probe sees of it: the sign of "
+        "the distance (--polarity), the static gain (--static-gain) or the encoder's latch is not "
+        "as stated; make a step test, and give it (--calibration)"
+    ]
+
+
+def _highest_excited(found: SelfCalibration) -> float:
+    """Return the highest frequency [Hz] at which the surface shows G off by the usual limits."""
+    known = found.agreement.noise * np.sqrt(2 / found.points)
+    limits = ResponseLimits()
+    excited = found.amplitudes * min(limits.gain, limits.phase) > COVERAGE_FACTOR * known
+    highest = int(np.max(np.flatnonzero(excited), initial=0)) + 1
+    return highest * max(map(abs, found.speeds)) / (2 * np.pi)
+
+
+def _inverse_of_what_varies(matrix: FloatArray) -> FloatArray:
+    """Return the inverse of a covariance (2, 2) whose rows have different units and may be zero."""
+    deviation = np.sqrt(np.diag(matrix))
+    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+    correlation = matrix * scale * scale[:, np.newaxis]
+    return np.asarray(np.linalg.pinv(correlation, hermitian=True) * scale * scale[:, np.newaxis])
+
+
+# Is the lag latency, or mechanics? Two scans in opposite directions decide.
+#
+# A late probe looks where the workpiece was a moment ago: each height belongs to a point
+# ``lag`` earlier on the path, and turning the spindle the other way shifts it to the other
+# side. A mechanical lag of Z alone does not. It is :func:`self_calibrate` with a step test
+# before it, and two directions for two speeds.
+#
+# Where Z follows the surface, an error of the calibration's own delay leaves the same mark. The
+# estimate cannot be better than that delay is known.
+
+
+@dataclass(frozen=True)
+class Reversal:
+    """What scans in opposite directions say: how late the probe's reading is against X and C.
+
+    lag, uncertainty: [s], k = 1;  lag_of_z: of the calibration at low frequency [s]
+    residual: rms that lag and surface leave [m];  used: points fitted
+    latency: True if the lag of Z is latency, False if mechanical, None if neither within 3 u
+    calibration: with what was found in it
+    """
+
+    lag: float
+    uncertainty: float
+    lag_of_z: float
+    residual: float
+    used: int
+    latency: bool | None
+    calibration: Calibration
+
+
+def reversal(
+    scans: Sequence[ScanColumns], calibration: Calibration, harmonics: int = DEFAULT_HARMONICS
+) -> Reversal:
+    """Return the lag of the probe against X and C from scans in opposite directions.
+
+    scans: corrected with ``calibration``, two or more, of one surface
+    harmonics: of the surface in a turn; more for a rougher surface
+
+    Raises DataError if the scans turn the same way, are too short, or the surface has no
+    slope along the path.
+    """
+    turns = [float(scan.angular_rate.sum()) for scan in scans]
+    if len(scans) > 1 and not min(turns) < 0 < max(turns):
+        raise DataError("both scans turn the same way; reverse the spindle for one of them")
+    found = self_calibrate(scans, after_step_test(calibration), harmonics)
+    lag, of_z = float(found.values[LATENCY]), calibration.dynamics.low_frequency_delay
+    uncertainty = float(found.covariance[LATENCY, LATENCY] ** 0.5)
+    return Reversal(
+        lag=lag,
+        uncertainty=uncertainty,
+        lag_of_z=of_z,
+        residual=found.residual,
+        used=found.points,
+        latency=_verdict(lag, uncertainty, of_z),
+        calibration=resolved(calibration, found),
+    )
+
+
+def _verdict(lag: float, uncertainty: float, lag_of_z: float) -> bool | None:
+    late, prompt = abs(lag - lag_of_z) <= 3 * uncertainty, abs(lag) <= 3 * uncertainty
+    return late if late != prompt else None

@@ -1,0 +1,171 @@
+"""A scan as self-calibration and reversal see it: heights, where on the part, how Z moved.
+
+Axes hardly ever drop out, so velocities are taken from them alone, by a local polynomial
+(Savitzky-Golay); a reading that is missing costs its own point only, an axis' its neighbours too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy import ndimage, signal
+
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.streams.blocks import AxisBlock, BoolArray, FloatArray, uninterrupted
+from omsm_ros.core.streams.statistics import EvenSelection
+from omsm_ros.errors import DataError
+
+# One turn a second at 1 kHz; fewer points do not determine a surface.
+_LEAST_POINTS = 1000
+# Of one scan: 72 bytes each; a portion of them at a time is made into rows of the fit.
+_MOST_POINTS = 500_000
+# A fourth-order polynomial over ±12 ms: at the 12th harmonic of a turn a second the velocity
+# is 1 % short, of an amplitude that is nanometres; at the second harmonic it is exact to 2e-6.
+_HALF_WINDOW_S = 12e-3
+_POLYNOMIAL = 4
+# Enough for a steady pace, few enough to be held.
+_PORTION_SAMPLES = 20_000
+_COLUMNS = ("time", "radius", "angle", "radial_rate", "angular_rate", "height", "motion_rate",
+            "motion_acceleration", "motion")  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanColumns:
+    """A scan, each array (n,), in the order of time.
+
+    time: since the first sample [s];  radius, angle: on the part [m], [rad]
+    radial_rate, angular_rate: of the slides over the part [m/s], [rad/s]
+    height: H(z) plus true distance [m];  motion: H(z) [m]
+    motion_rate, motion_acceleration: of the Z encoder [m/s], [m/s²]
+    """
+
+    time: FloatArray
+    radius: FloatArray
+    angle: FloatArray
+    radial_rate: FloatArray
+    angular_rate: FloatArray
+    height: FloatArray
+    motion_rate: FloatArray
+    motion_acceleration: FloatArray
+    motion: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+class ScanReader:
+    """Gathers a scan that comes in portions, in bounded memory.
+
+    points: how many came;  used: how many, evenly chosen, are kept to be fitted
+    """
+
+    def __init__(self, sample_period: float) -> None:
+        self._period = sample_period
+        half = max(round(_HALF_WINDOW_S / sample_period), _POLYNOMIAL)
+        self._half = half
+        self._kernels = [
+            signal.savgol_coeffs(2 * half + 1, _POLYNOMIAL, deriv=d, delta=sample_period)
+            for d in (1, 2)
+        ]
+        self._axes: list[AxisBlock] = []
+        self._points: list[SurfacePoints] = []
+        self._kept = EvenSelection(_MOST_POINTS)
+        self._first: int | None = None
+        self.points = 0
+
+    @property
+    def used(self) -> int:
+        """Points that are kept."""
+        return len(self._kept)
+
+    def add_axes(self, block: AxisBlock) -> None:
+        """Take in the next axis block, before the points that come of it."""
+        if self._first is None:
+            self._first = block.first_sample
+        self._axes += _known_parts(block)
+
+    def add(self, points: SurfacePoints) -> None:
+        """Take in the next points, corrected with no geometry and no lateral lag."""
+        self.points += len(points)
+        self._points.append(points)
+        if sum(map(len, self._points)) > _PORTION_SAMPLES:
+            self._digest(last=False)
+
+    def columns(self) -> ScanColumns:
+        """Return the points kept, once all have come.
+
+        Raises DataError for a scan that is too short.
+        """
+        self._digest(last=True)
+        if self.used < _LEAST_POINTS:
+            raise DataError(
+                f"scan of {self.points} points, {self.used} of them with all their neighbours; "
+                f"expected {_LEAST_POINTS} or more: record a longer scan"
+            )
+        return ScanColumns(**dict(zip(_COLUMNS, self._kept.rows().T, strict=True)))
+
+    def _digest(self, *, last: bool) -> None:
+        """Keep the points whose neighbourhood is known; those at the ends of a run have none."""
+        points = join_points(self._points)
+        if not self._axes or not len(points):
+            return
+        for run in uninterrupted(self._axes):
+            begin, end = run[0].first_sample, run[-1].end
+            known = (points.sample >= begin + self._half) & (points.sample < end - self._half)
+            if known.any():
+                self._keep(run, points, known)
+        # A point of the newest run may still wait for the axes that follow it.
+        waits = (points.sample >= end - self._half) & (not last)
+        self._points = [points.part(slice(int(np.argmax(waits)), None))] if waits.any() else []
+        needed = points.sample[-1] - 2 * self._half
+        self._axes = [b for b in self._axes if b.end > needed]
+
+    def _keep(self, run: list[AxisBlock], points: SurfacePoints, known: BoolArray) -> None:
+        x, y, z, c = (np.concatenate([getattr(b, n) for b in run]) for n in "xyzc")
+        sample, height = points.sample[known], points.height[known]
+        place = sample - run[0].first_sample
+        across, along = workpiece_xy(x, y, c)
+        radius, angle = np.hypot(across, along), np.unwrap(np.arctan2(along, across))
+        columns = [
+            (sample - (self._first or 0)) * self._period,
+            radius[place],
+            angle[place],
+            self._derivative(radius, 0)[place],
+            self._derivative(angle, 0)[place],
+            height,
+            self._derivative(z, 0)[place],
+            self._derivative(z, 1)[place],
+            z[place] - points.dynamic_error[known],
+        ]
+        self._kept.add(np.stack(columns, axis=1))
+
+    def _derivative(self, values: FloatArray, kernel: int) -> FloatArray:
+        return np.asarray(
+            ndimage.convolve1d(values, self._kernels[kernel], mode="nearest"), np.float64
+        )
+
+
+def _known_parts(block: AxisBlock) -> Iterator[AxisBlock]:
+    """Yield what lies between samples that were lost: a gap, whichever way they went missing."""
+    columns = {name: getattr(block, name) for name in "xyzbc"}
+    known = np.all(np.isfinite([*columns.values()]), axis=0)
+    edges = [0, *(np.flatnonzero(np.diff(known)) + 1), len(block)]
+    for start, stop in pairwise(map(int, edges)):
+        if known[start]:
+            yield replace(
+                block,
+                first_sample=block.first_sample + start,
+                **{name: values[start:stop] for name, values in columns.items()},
+            )
+
+
+def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:
+    """Return the scan behind ``points``, which all come of one block."""
+    reader = ScanReader(axes.sample_period)
+    reader.add_axes(axes)
+    reader.add(points)
+    return reader.columns()

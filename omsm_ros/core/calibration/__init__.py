@@ -1,0 +1,1 @@
+"""Calibrations: what they hold, when they apply, how they repeat."""

@@ -1,0 +1,66 @@
+"""Of many measurements: which stands out, and do they drift?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+
+# Iglewicz and Hoaglin, How to Detect and Handle Outliers, 1993: 3.5 of the modified z-score.
+_LIMIT = 3.5
+# The median absolute deviation of a normal distribution is 0.6745 of its standard deviation.
+_NORMAL = 0.6745
+# Of fewer, a median and its spread say nothing.
+FEWEST = 5
+# All slopes between so many points are half a million: milliseconds, and a few megabytes.
+_MOST = 1000
+
+
+def outliers(values: FloatArray) -> BoolArray:
+    """Return True for each of ``values`` (n,) that lies far from the others; NaN never does.
+
+    By the modified z-score ``0.6745 |v − median| / MAD`` > 3.5. Of fewer than five nothing is
+    said; where half the values are equal, every other one stands out by its mean deviation.
+    """
+    found = np.zeros(len(values), np.bool_)
+    known = np.isfinite(values)
+    if np.sum(known) < FEWEST:
+        return found
+    away = np.abs(values[known] - np.median(values[known]))
+    spread = np.median(away) / _NORMAL or np.mean(away) * np.sqrt(np.pi / 2)
+    found[known] = away > _LIMIT * spread if spread > 0 else False
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """The slope of values over time [unit/s], with the ends of its 95 % interval."""
+
+    slope: float
+    low: float
+    high: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether zero lies outside the interval."""
+        return self.low > 0 or self.high < 0
+
+
+def trend(times: FloatArray, values: FloatArray) -> Trend | None:
+    """Return the slope of ``values`` (n,) over ``times`` [s] (n,) after Theil and Sen.
+
+    The median of all slopes between two points: a third of the points may be wrong. Of more than
+    1000 points, 1000 are taken evenly from the first to the last. None for fewer than five known
+    values, or where all were taken at one time.
+    """
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(times))
+    if len(known) < FEWEST or np.ptp(times[known]) <= 0:
+        return None
+    if len(known) > _MOST:
+        known = known[np.argsort(times[known], kind="stable")]
+        known = known[np.linspace(0, len(known) - 1, _MOST).round().astype(np.int64)]
+    found = stats.theilslopes(values[known], times[known], alpha=0.95)
+    return Trend(float(found.slope), float(found.low_slope), float(found.high_slope))

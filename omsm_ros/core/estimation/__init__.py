@@ -1,0 +1,1 @@
+"""Estimation of transfer functions from records."""

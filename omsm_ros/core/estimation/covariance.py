@@ -1,0 +1,155 @@
+"""How well are the parameters of a fit known, in coloured noise?"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from omsm_ros.core.estimation.noise import scatter_in_time, uneven_rows
+from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Two orders for each of six lines of hum.
+_MAX_NOISE_ORDER = 12
+# Of transforms that are in memory at a time.
+_VALUES = 4_000_000
+# Directions of the parameter space this much weaker than the strongest are lost in rounding.
+_RANK_TOLERANCE = 1e-11
+
+
+def autoregression(
+    residual: FloatArray, highest: int = _MAX_NOISE_ORDER
+) -> tuple[FloatArray, float]:
+    """Return the whitening filter [1, a1 …] of a residual (n,) and the variance of its output.
+
+    By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
+    """
+    n = len(residual)
+    highest = min(highest, n - 1)
+    lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
+    lags = np.array(lagged, np.float64) / n
+    coefficients: FloatArray = np.ones(1)
+    variance = float(lags[0])
+    if variance <= 0:
+        return coefficients, 0.0
+    best = (n * np.log(variance), coefficients, variance)
+    for order in range(1, highest + 1):
+        # Levinson's recursion.
+        reflection = -float(coefficients @ lags[order:0:-1]) / variance
+        padded = np.append(coefficients, 0.0)
+        coefficients = padded + reflection * padded[::-1]
+        variance *= 1 - reflection**2
+        score = n * np.log(variance) + order * np.log(n)
+        if score < best[0]:
+            best = (score, coefficients, variance)
+    return np.asarray(best[1]), best[2]
+
+
+def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
+    """Return the variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies."""
+    coefficients, variance = autoregression(residual)
+    return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
+
+
+def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:
+    """Return the covariance (c, c) of ``rows`` (c, n) times noise of a variance spectrum.
+
+    noise: (``length`` // 2 + 1,), at the frequencies of a transform of ``length``
+    """
+    weight = 2.0 * noise / length
+    weight[0] *= 0.5
+    if length % 2 == 0:
+        weight[-1] *= 0.5
+    weight = np.sqrt(weight)
+
+    def parts(block: slice) -> FloatArray:
+        found = np.empty((len(rows[block]), 2 * len(weight)))
+        for row, part in zip(rows[block], found, strict=True):
+            part[:] = (weight * fft.rfft(row, length)).view(np.float64)
+        return found
+
+    # Of a long record not all at once: that takes as much memory again.
+    step = max(_VALUES // length, 1)
+    blocks = [slice(first, first + step) for first in range(0, len(rows), step)]
+    gram = np.empty((len(rows), len(rows)))
+    for i, block in enumerate(blocks):
+        mine = parts(block)
+        gram[block, block] = mine @ mine.T
+        for other in blocks[:i]:
+            gram[block, other] = mine @ parts(other).T
+            gram[other, block] = gram[block, other].T
+    return gram
+
+
+def parameter_covariance(
+    problem: Problem,
+    columns: FloatArray,
+    residual: FloatArray,
+    passed: TransferFunction | None = None,
+) -> FloatArray:
+    """Return the covariance (q, q) of the parameters of ``columns`` (k, q) in coloured noise.
+
+    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
+
+    passed: fit whose response brings the encoder's noise into the residual; None if none is
+        to be added. A sharp resonance amplifies that noise at its own frequency, in a line too
+        narrow for the residual to show.
+    """
+    samples, size = columns.shape
+    residual = residual * np.sqrt(samples / max(samples - size, 1))
+    length = fft.next_fast_len(len(problem.used) + _MAX_NOISE_ORDER, real=True)
+    noise = noise_spectrum(residual, length)
+    if passed is not None:
+        came = _motion_noise_spectrum(problem, passed, length)
+        noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
+    on_grid = np.zeros((size, len(problem.used)))
+    on_grid[:, problem.used] = columns.T
+    uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
+    meat = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
+    gram = columns.T @ columns
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+    least = _RANK_TOLERANCE * float(values[-1])
+    strong, weak = directions[:, values > least], directions[:, values <= least]
+    bread = strong / values[values > least] @ strong.T
+    inside = bread @ (meat / np.outer(scale, scale)) @ bread
+    # A direction lost in rounding gets at least the variance of the weakest one that is not.
+    inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
+    covariance = inside / np.outer(scale, scale)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
+    """Return the relative standard uncertainty of the gain with lag and curvature fitted too."""
+    every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
+    return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
+
+
+def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
+    """Return the spectrum of what ``passed`` makes of the motion's noise, where there is motion."""
+    frequency = fft.rfftfreq(length, problem.period)
+    moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
+    power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2
+    return np.asarray(np.where(moves, power, 0.0))
+
+
+def hidden_motion_covariance(
+    dynamics: TransferFunction, delay_bound: float, sample_period: float
+) -> FloatArray:
+    """Return the covariance (p, p) of the coefficients due to motion hidden between samples.
+
+    Folded motion shifts the lag by up to ``delay_bound`` [s], and bends the response by a
+    term in s² as the folded content varies over a tenth of the sampling rate around it.
+    Either is a bound, taken as a uniform distribution: its standard deviation is 1/√3 of it.
+    """
+    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
+    directions = np.zeros((2, zeros + poles + 2))
+    bend = delay_bound * sample_period / (2 * np.pi * 0.1)
+    for row, (power, size) in enumerate(((1, delay_bound), (2, bend))):
+        if poles >= power:
+            directions[row, zeros + power] = size / np.sqrt(3)
+        elif power == 1:
+            directions[row, -1] = size / np.sqrt(3)
+    return directions.T @ directions

@@ -1,0 +1,155 @@
+"""Which transfer functions a fit may choose from, and how their coefficients are parametrised.
+
+A structure is a number of zeros, a number of poles, and a delay or none. Its denominator
+is a product of sections ``1 + e^α s + e^β s²``, so that every parameter vector is a
+stable G(s) with G(0) = 1, and no search can leave that set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Poles may be this many e-folds of time constant away from the content of the motion.
+_LOG_RANGE = 16.0
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Structure:
+    """``zeros`` ≤ ``poles``, and whether the delay is free."""
+
+    poles: int
+    zeros: int
+    delay: bool
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters."""
+        return self.poles + self.zeros + self.delay
+
+    @property
+    def pairs(self) -> int:
+        """Number of second-order sections; an odd pole has a section of its own."""
+        return self.poles // 2
+
+    def contains(self, other: Structure) -> bool:
+        """Return True if ``other`` is a smaller special case of this one."""
+        return (
+            other.size < self.size
+            and other.poles <= self.poles
+            and other.zeros <= self.zeros
+            and other.delay <= self.delay
+        )
+
+    def label(self) -> str:
+        """Return the structure in words: ``2 zeros, 3 poles, delay``."""
+        return f"{self.zeros} zeros, {self.poles} poles{', delay' if self.delay else ''}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scaled:
+    """A structure with ``s`` in units of ``rate`` [rad/s], which keeps coefficients near 1.
+
+    Its *nonlinear parameters* ψ (n + delay,) hold α of each section, β of each pair, and the
+    delay. The numerator (m+1,) is not among them, for it enters a fit linearly.
+    """
+
+    structure: Structure
+    rate: float
+
+    @property
+    def nonlinear_size(self) -> int:
+        """Number of entries of ψ."""
+        return self.structure.poles + self.structure.delay
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the box of ψ: any pole from far below to far above ``rate``; delay ≥ 0."""
+        lower = np.full(self.nonlinear_size, -_LOG_RANGE)
+        upper = np.full(self.nonlinear_size, _LOG_RANGE)
+        if self.structure.delay:
+            lower[-1], upper[-1] = 0.0, np.inf
+        return lower, upper
+
+    def sections(self, nonlinear: FloatArray) -> list[FloatArray]:
+        """Return the ascending factors of the denominator, [1, d1, d2] for a pair or [1, d1]."""
+        alpha, beta = self._logs(nonlinear)
+        return [
+            np.exp(np.concatenate([np.zeros(1), alpha[i : i + 1], beta[i : i + 1]]))
+            for i in range(len(alpha))
+        ]
+
+    def _logs(self, nonlinear: FloatArray) -> tuple[FloatArray, FloatArray]:
+        singles = self.structure.poles - self.structure.pairs
+        return nonlinear[:singles], nonlinear[singles : self.structure.poles]
+
+    def _delay(self, nonlinear: FloatArray) -> float:
+        return float(nonlinear[-1]) if self.structure.delay else 0.0
+
+    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return L = e^{-τs} / denominator at scaled ``s`` (k,), (k,)."""
+        denominator = np.ones_like(s)
+        for section in self.sections(nonlinear):
+            denominator = denominator * polynomial.polyval(s, section)
+        if not self.structure.delay:
+            return np.asarray(1 / denominator)
+        return np.asarray(np.exp(-self._delay(nonlinear) * s) / denominator)
+
+    def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
+        first, second = [], []
+        for section in self.sections(nonlinear):
+            value = polynomial.polyval(s, section)
+            if len(section) == 3:
+                second.append(-section[2] * s * s / value)
+            first.append(-section[1] * s / value)
+        tail = [-s] if self.structure.delay else []
+        return np.array(first + second + tail, np.complex128).reshape(-1, len(s))
+
+    def transfer_function(self, nonlinear: FloatArray, numerator: FloatArray) -> TransferFunction:
+        """Return G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
+        denominator: FloatArray = np.ones(1)
+        for section in self.sections(nonlinear):
+            denominator = np.asarray(polynomial.polymul(denominator, section), np.float64)
+        return TransferFunction(
+            numerator / self.rate ** np.arange(len(numerator)),
+            denominator / self.rate ** np.arange(len(denominator)),
+            self._delay(nonlinear) / self.rate,
+        )
+
+    def coefficient_jacobian(self, nonlinear: FloatArray) -> FloatArray:
+        """Return d(numerator, denominator[1:], delay)/d(numerator[1:], ψ), SI over scaled.
+
+        Shape (m+1 + n + 1, m + len ψ); the row of numerator[0] = 1 is zero.
+        """
+        zeros, poles = self.structure.zeros, self.structure.poles
+        jacobian = np.zeros((zeros + poles + 2, zeros + self.nonlinear_size))
+        jacobian[1 : zeros + 1, :zeros] = np.eye(zeros)
+        sections = self.sections(nonlinear)
+        for column in range(poles):
+            pair, power = (column, 1) if column < len(sections) else (column - len(sections), 2)
+            product: FloatArray = np.zeros(power + 1)
+            product[power] = sections[pair][power]
+            for other in sections[:pair] + sections[pair + 1 :]:
+                product = np.asarray(polynomial.polymul(product, other), np.float64)
+            jacobian[zeros + 1 : zeros + len(product), zeros + column] = product[1:]
+        if self.structure.delay:
+            jacobian[-1, -1] = 1.0
+        powers = np.concatenate([np.arange(zeros + 1.0), np.arange(1.0, poles + 1), [1.0]])
+        return self.rate ** -powers[:, np.newaxis] * jacobian
+
+    def nonlinear_of(self, poles: ComplexArray, delay: float) -> FloatArray:
+        """Return ψ of given stable scaled ``poles`` (n,), conjugates included, and ``delay``."""
+        sections = [(-2 * p.real / abs(p) ** 2, abs(p) ** -2) for p in poles if p.imag > 0]
+        real = sorted((p.real for p in poles if p.imag == 0), key=abs)
+        while len(real) >= 2:
+            p, q = real.pop(), real.pop()
+            sections.append((-(p + q) / (p * q), 1 / (p * q)))
+        firsts = [first for first, _ in sections] + [-1 / p for p in real]
+        logs = np.log(np.concatenate([firsts, [second for _, second in sections]]))
+        tail = [delay] if self.structure.delay else []
+        return np.concatenate([np.clip(logs, -_LOG_RANGE, _LOG_RANGE), tail])

@@ -1,0 +1,395 @@
+"""Fit G(s) to an input and an output by the error of the output.
+
+The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
+``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is
+exact for any G and any delay as long as the encoder has nothing beyond half the sampling
+rate; :mod:`~omsm_ros.core.identification.covariance_terms` bounds what an edge may hide there.
+Model and data are compared in time, so a missing sample is simply not compared.
+Gain, offset and drift enter linearly and are eliminated (variable projection, Golub and
+Pereyra 1973, with Kaufman's simplification of the derivative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import fft, linalg, ndimage
+
+from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.optimisation import Effort, Projection, descend
+from omsm_ros.core.kinematics.trajectories import s_curve
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.linear_algebra import least_squares
+
+# A recorded motion as one period, and its spectrum without the noise of the encoder.
+
+# Long enough that a bridge across the whole travel adds nothing near the fastest motion.
+_BRIDGE_S = 0.3
+# Where samples are slow a bridge must still be smooth to them.
+_MIN_BRIDGE_SAMPLES = 64
+# In it a light mode rings down.
+_REST_S = 1.0
+# A record of milliseconds tells of no mode that rings for a second: so many times as long it rests.
+_RESTS_OF_RECORD = 4.0
+# Power is then known to 10 %.
+_SMOOTHING_BINS = 101
+
+
+def close_period(motion: FloatArray, period: float) -> FloatArray:
+    """Return ``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
+
+    On the way back it rests, until nothing rings when the record starts anew.
+    """
+    duration = len(motion) * period
+    bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
+    rest = round(min(_REST_S, _RESTS_OF_RECORD * duration) / period)
+    total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
+    phase = np.arange(1, total - len(motion) + 1) / bridge
+    way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
+    return np.concatenate([motion, way_back])
+
+
+def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
+    """Return what is motion in its ``spectrum`` (k,), up to the last frequency that has any.
+
+    Wiener's filter. Where an encoder shows only its noise, the probe saw nothing of it;
+    a fit that took it for motion would be paid for a response that vanishes there.
+    """
+    if noise_power <= 0:
+        return spectrum
+    width = min(_SMOOTHING_BINS, len(spectrum))
+    power = np.abs(spectrum) ** 2
+    smooth = ndimage.uniform_filter1d(power, width, mode="nearest")
+    weight = np.clip(1 - noise_power / np.maximum(smooth, np.finfo(np.float64).tiny), 0.0, 1.0)
+    # A mean of m exponential variables scatters by 1/√m; twice that is not motion.
+    weight[weight < 3 / np.sqrt(width)] = 0.0
+    last = int(np.flatnonzero(weight)[-1]) if np.any(weight) else 0
+    return np.asarray((weight * spectrum)[: last + 1], np.complex128)
+
+
+def motion_spectrum(motion: FloatArray, period: float, noise: float) -> ComplexArray:
+    """Transform of ``motion`` (n,), closed to a period, up to its last content, (k,).
+
+    noise: standard deviation of a sample of the motion [m], taken out
+    """
+    closed = np.asarray(fft.rfft(close_period(motion, period)), np.complex128)
+    return denoised(closed, len(motion) * noise**2)
+
+
+# A linear column weaker than this part of the strongest is rounding.
+_RANK_TOLERANCE = 1e-12
+# Columns that LAPACK takes at a time.
+_BLOCK = 32
+# Of columns that are in memory at a time beside the result.
+_VALUES = 4_000_000
+# Of each start; held inputs need five (docs/design/identification-ablation.md).
+_RACE_EVALUATIONS = 5
+# A bound for fits that creep along a valley; others end by convergence before.
+_FINISH_EVALUATIONS = 60
+# The pulse before a record has this content left, as a power of e, where its band ends.
+_PULSE_END = 14.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted: ``output`` (n,) where ``used`` (n,), by ``input`` (n,) and ``background``.
+
+    background: (n, q) columns of what adds to the output whatever the axis does (offset, drift …)
+    rate: [rad/s] unit of s inside the fit
+    noise: standard deviation of a sample of the motion [m]
+    fits_initial_condition: fit the response to the unknown motion before the first sample too
+    plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
+    shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
+    unfollowed: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
+    effort: what was tried of this problem, and of those made of it
+    """
+
+    input: FloatArray
+    output: FloatArray
+    used: BoolArray
+    period: float
+    background: FloatArray
+    rate: float
+    noise: float = 0.0
+    fits_initial_condition: bool = False
+    plateau: IntArray | None = None
+    shared: float = 0.0
+    unfollowed: FloatArray | None = None
+    effort: Effort = field(default_factory=Effort)
+
+    @cached_property
+    def closed_length(self) -> int:
+        """Samples of one period."""
+        return len(close_period(self.input, self.period))
+
+    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
+        return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
+
+    def padded_spectrum(self, values: FloatArray) -> ComplexArray:
+        """Transform of ``values`` (n,) and nothing after them, at ``s``, shape (k,)."""
+        return np.asarray(fft.rfft(values, self.closed_length))[: len(self.s)]
+
+    @cached_property
+    def _spectrum(self) -> ComplexArray:
+        moved = motion_spectrum(self.input, self.period, self.noise)
+        # A decay may be faster than anything in the motion: then the whole band is needed.
+        missing = self.closed_length // 2 + 1 - len(moved)
+        return np.pad(moved, (0, missing)) if self.fits_initial_condition else moved
+
+    @cached_property
+    def s(self) -> ComplexArray:
+        """jω / rate of the transform of the closed motion, up to its last content, (k,)."""
+        omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
+        return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
+
+    def parametrised(self, structure: Structure) -> Scaled:
+        """Return how ``structure`` is parametrised over ``s``."""
+        return Scaled(structure, self.rate)
+
+    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
+        """Return what drives the system: spectra (k,), each with its number of numerator terms."""
+        motion = (self._spectrum, structure.zeros + 1)
+        return [motion, (self._pulse, structure.poles)] if self.fits_initial_condition else [motion]
+
+    @cached_property
+    def _pulse(self) -> ComplexArray:
+        """Spectrum (k,) of a Gaussian that is over before the first sample.
+
+        After it, its n derivatives through n poles are as many free decays, and any of them.
+        """
+        angle = self.s.imag * self.rate
+        width = np.sqrt(2 * _PULSE_END) / max(float(angle[-1]), np.finfo(np.float64).tiny)
+        centre = -np.sqrt(2 * _PULSE_END) * width
+        return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
+
+    def initial_condition_response(self, fitted: Fit) -> FloatArray:
+        """Return the decays (n, poles) at the poles of ``fitted`` from before the first sample."""
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
+        powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
+        decays = fft.irfft(powers * (lag * self._pulse), self.closed_length)
+        return np.asarray(decays[:, : len(self.input)].T)
+
+    @cached_property
+    def _target(self) -> FloatArray:
+        return self.output[self.used]
+
+    @cached_property
+    def _places(self) -> IntArray:
+        return np.flatnonzero(self.used)
+
+    @cached_property
+    def _fixed(self) -> FloatArray:
+        return self.background[self.used]
+
+    def _in_time(self, spectra: ComplexArray) -> FloatArray:
+        found = np.empty((len(spectra), len(self._places)))
+        # All at once take a long record's memory again.
+        step = max(_VALUES // self.closed_length, 1)
+        for first in range(0, len(spectra), step):
+            part = slice(first, first + step)
+            values = fft.irfft(spectra[part], self.closed_length, axis=-1)
+            np.take(values, self._places, axis=-1, out=found[part])
+        return found
+
+    def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
+        """Return the residual at one ψ after the linear parameters are eliminated."""
+        self.effort.count(len(self._places))
+        structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
+        moved = self._moved(structure, lag)
+        # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
+        columns = np.concatenate([moved, self._fixed.T, self._target[np.newaxis]]).T
+        size = columns.shape[1] - 1
+        # The target among the columns: what it is on their basis needs no basis then.
+        (packed, factors), triangle = linalg.qr(columns, mode="raw", check_finite=False)
+        linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
+        residual = self._target - columns[:, :size] @ linear
+
+        def derivative() -> FloatArray:
+            basis = linalg.lapack.dorgqr(packed[:, :size], factors[:size], lwork=_BLOCK * size)[0]
+            answer = self._answer(structure, lag, linear[: len(moved)])
+            slopes = self._in_time(scaled.lag_slopes(nonlinear, self.s) * answer).T
+            return np.asarray(basis @ (basis.T @ slopes) - slopes)
+
+        return Projection(nonlinear, residual, linear, derivative)
+
+    def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
+        """Return the linear columns where they are compared, (terms, k)."""
+        return self._in_time(self._driven(structure, lag))
+
+    def _answer(
+        self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
+    ) -> ComplexArray:
+        """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
+        total, place = np.zeros_like(lag), 0
+        for spectrum, count in self.drives(structure):
+            # A pulse before the record has no term where there is no pole.
+            part = np.append(coefficients[place : place + count], 0.0)
+            total += polynomial.polyval(self.s, part) * spectrum
+            place += count
+        return lag * total
+
+    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
+        """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
+        terms = []
+        for spectrum, count in self.drives(structure):
+            term = lag * spectrum
+            # One more factor each: powers of complex numbers take a logarithm.
+            for _ in range(count):
+                terms.append(term)
+                term = term * self.s
+        return np.array(terms)
+
+    def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:
+        """Return ``values`` (k,) of the compared samples at their places, (n,)."""
+        grid = np.full(len(self.used), elsewhere)
+        grid[self.used] = values
+        return grid
+
+    def response(self, fitted: Fit) -> FloatArray:
+        """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""
+        spectrum = self.output_spectrum(fitted) / fitted.gain
+        return np.asarray(fft.irfft(spectrum, self.closed_length)[: len(self.input)])
+
+    def output_spectrum(self, fitted: Fit) -> ComplexArray:
+        """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
+        driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
+        return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
+
+    def modelled(self, fitted: Fit) -> FloatArray:
+        """Return the output (n,) of the fitted model at every sample."""
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
+        driven = fitted.driven @ self._driven(fitted.structure, lag)
+        moved = fft.irfft(driven, self.closed_length)[: len(self.input)]
+        return np.asarray(moved + self.background @ fitted.background)
+
+    def sensitivity(self, fitted: Fit) -> FloatArray:
+        """Return d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
+        driven = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
+        terms = len(fitted.numerator)
+        by_numerator = fitted.gain * driven[1:terms]
+        slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
+        by_nonlinear = slopes * (fitted.driven @ driven)
+        by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
+        return self._beside_background([by_numerator, by_nonlinear, by_gain, driven[terms:]])
+
+    def _beside_background(self, spectra: Sequence[ComplexArray]) -> FloatArray:
+        """Return columns (k, …) of all ``spectra`` (…, k), then those of the background."""
+        count = sum(map(len, spectra))
+        rows = np.empty((count + self.background.shape[1], len(self._places)))
+        rows[count:] = self._fixed.T
+        first = 0
+        for part in spectra:
+            rows[first : first + len(part)] = self._in_time(part)
+            first += len(part)
+        return rows.T
+
+    def bent(self, fitted: Fit) -> FloatArray:
+        """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
+
+        That is by coefficients of 1, s and s² in front of it: any response bends like that.
+        """
+        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
+        driven = self._driven(fitted.structure, lag)
+        terms = len(fitted.numerator)
+        bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
+        return self._beside_background([bends, driven[terms:]])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted structure.
+
+    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
+    background: coefficients (q,);  residual: (k,) [m]
+    """
+
+    scaled: Scaled
+    nonlinear: FloatArray
+    driven: FloatArray
+    background: FloatArray
+    residual: FloatArray
+
+    @property
+    def structure(self) -> Structure:
+        """Poles, zeros and delay that were fitted."""
+        return self.scaled.structure
+
+    @property
+    def gain(self) -> float:
+        """Of the probe per motion at rest."""
+        return float(self.driven[0])
+
+    @property
+    def numerator(self) -> FloatArray:
+        """Scaled, (m+1,), numerator[0] = 1."""
+        return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters: of the structure, and of further drives."""
+        return self.structure.size + len(self.driven) - len(self.numerator)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return len(self.residual)
+
+    @property
+    def sum_of_squares(self) -> float:
+        """[m²]"""
+        return float(self.residual @ self.residual)
+
+    @property
+    def rms(self) -> float:
+        """Of the residual [m]."""
+        return float(np.sqrt(self.sum_of_squares / self.samples))
+
+    @property
+    def dynamics(self) -> TransferFunction:
+        """G(s) with G(0) = 1."""
+        return self.scaled.transfer_function(self.nonlinear, self.numerator)
+
+
+def fit(
+    problem: Problem,
+    structure: Structure,
+    starts: Sequence[FloatArray],
+    evaluations: int = _FINISH_EVALUATIONS,
+) -> Fit:
+    """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them.
+
+    evaluations: to that minimum, at most
+    """
+    scaled = problem.parametrised(structure)
+    box = scaled.bounds()
+
+    def project(nonlinear: FloatArray) -> Projection:
+        return problem.project(scaled, nonlinear)
+
+    best, least = None, np.inf
+    for start in starts:
+        found = descend(project, project(np.clip(start, *box)), box, _RACE_EVALUATIONS)
+        cost = float(np.sum(found.residual**2))
+        if best is None or cost < least:
+            best, least = found, cost
+    if best is None:
+        raise ValueError("no start to fit from, expected one or more")
+    return _fit_at(problem, scaled, descend(project, best, box, evaluations))
+
+
+def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
+    """Return ``structure`` at ψ as it is; only what enters linearly is fitted."""
+    scaled = problem.parametrised(structure)
+    return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
+
+
+def _fit_at(problem: Problem, scaled: Scaled, at: Projection) -> Fit:
+    terms = len(at.linear) - problem.background.shape[1]
+    return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)

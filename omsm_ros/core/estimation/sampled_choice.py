@@ -1,0 +1,435 @@
+"""Which sampled model predicts best the parts of a record that were hidden from its fit?
+
+Orders are fitted to the first part of the record and run freely over the rest. The few that
+predict it best are then judged on several hidden parts, as they are and with their residual
+whitened, which is efficient only for a model that has all the dynamics. Of those that
+predict equally well the simplest is taken: superfluous poles would follow a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.estimation.covariance import autoregression
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import Fit, fit
+from omsm_ros.core.estimation.sampled_fit import (
+    RATE_SAMPLES,
+    DiscreteScaled,
+    DiscreteStarts,
+    HeldProblem,
+    grown,
+    with_fast_pole,
+)
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.errors import IdentificationError
+
+# As many as the table of quantities lets a user ask for.
+MAX_ORDER = 20
+# Parts of the used samples; all but the first are hidden once, and the last three together.
+_PARTS = 6
+# Part of the used samples to which every order is fitted first.
+_FIRST_PART = 0.75
+# Orders that are judged on every hidden part: so many of the best over the last part, and of
+# the lowest within this factor of the least error. One part alone misjudges by about as much.
+_FINALISTS = 3
+_ABOUT_AS_GOOD = 2.0
+# So many orders in a row that predict no better than the best so far end the search.
+_FRUITLESS = 5
+# By so many standard errors a model has to predict better to beat another. A pole too few costs a
+# record with disturbances more than one too many (docs/design/identification-ablation.md).
+_BEATS_BY = 0.5
+# Order of the model by which the delay is chosen.
+_DELAY_ORDER = 3
+# Samples for each parameter: with fewer, an order is not tried.
+_LEAST_SAMPLES_EACH = 3
+# Sixty columns of them, and their spectra, take a third of a gigabyte.
+_MOST_SAMPLES = 200_000
+# Of the refit without a hidden part, which starts at the minimum over all of them: what more would
+# gain is less than what one part misjudges by, and on orders beyond ten takes most of the time.
+_HIDDEN_EVALUATIONS = 5
+# Of the power of the strongest direction: what is weaker is rounding of a text with six digits.
+_UNEXCITED = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class SampledCandidate:
+    """A fit to all used samples, and how it predicts.
+
+    order: poles;  whitened: fitted with its residual made white
+    hidden: mean square error of free runs over each hidden part (folds,), empty if not judged
+    """
+
+    problem: HeldProblem
+    fit: Fit
+    order: int
+    whitened: bool
+    hidden: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SampledChoice:
+    """chosen: of the order asked for, or freely;  free: the free choice
+    delay: whole samples;  by_order: mean square error [unit²] over the last part, of each order
+    """
+
+    chosen: SampledCandidate
+    free: SampledCandidate
+    delay: int
+    by_order: FloatArray
+
+
+def parameters(order: int) -> int:
+    """Return the number of parameters: denominator, numerator, initial state and offset."""
+    return 3 * order + 3
+
+
+def choose_sampled(
+    input: FloatArray,
+    output: FloatArray,
+    used: BoolArray,
+    period: float,
+    *,
+    order: int = 0,
+    max_delay: int = 0,
+) -> SampledChoice:
+    """Fit sampled models of ``input`` to ``output`` (n,) where ``used`` (n,), and choose.
+
+    order: number of poles, 0 to choose;  max_delay: whole samples to try
+
+    Raises IdentificationError when too few samples are used for the order asked for, or the input
+    has too few frequencies, for an order beyond MAX_ORDER, or where a value is not finite.
+    """
+    most = check_record(input, output, used, order)
+    centred = np.where(used, output - np.mean(output[used]), 0.0)
+    delay = _best_delay(input, centred, used, period, max_delay)
+    problem = delayed(input, centred, used, period, delay)
+    part = parts(problem.used)
+    early = replace(problem, used=problem.used & (part < _FIRST_PART * _PARTS))
+    late = problem.used & ~early.used
+    fits, by_order = _explored(early, late, most, order)
+    finalists = _finalists(by_order, order)
+    tried = [
+        SampledCandidate(problem, refitted(problem, fits[n], white), n, white, np.empty(0))
+        for n in finalists
+        for white in ((False, True) if n else (False,))
+    ]
+    judged = [replace(c, hidden=hidden_errors(c, part)) for c in tried]
+    starts = DiscreteStarts(problem.input, problem.output, problem.used, most)
+    free = _finished(plainest(judged), starts)
+    chosen = free
+    if order and order != free.order:
+        chosen = _finished(plainest([c for c in judged if c.order == order]), starts)
+    return SampledChoice(chosen, free, delay, by_order)
+
+
+def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: int) -> int:
+    """Return the highest order that a record can tell; raises as :func:`choose_sampled` does."""
+    most = _highest_order(int(np.sum(used)), order)
+    if np.ptp(input) == 0:
+        raise IdentificationError("the input never changes; excite it while recording")
+    if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
+        raise IdentificationError("a value of input or output is not finite where it is used")
+    return _most_excited(input, most, order)
+
+
+def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
+    """Return the candidate at the best minimum that starts from all used samples lead to."""
+    if candidate.order == 0 or candidate.whitened:
+        return candidate
+    every = [candidate.fit.nonlinear, *proposed(candidate.problem, candidate.order, starts)]
+    return replace(candidate, fit=fit(candidate.problem, candidate.fit.structure, every))
+
+
+def proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
+    """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
+    scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
+    every = [scaled.of_discrete(poles) for poles in starts.poles(order)]
+    return [p for p in every if len(p) == order and np.all(np.isfinite(p))]
+
+
+def _highest_order(samples: int, order: int) -> int:
+    if not 0 <= order <= MAX_ORDER:
+        raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_ORDER}")
+    if samples > _MOST_SAMPLES:
+        raise IdentificationError(
+            f"{samples!r} samples are used, at most {_MOST_SAMPLES} fit into memory beside their "
+            "derivatives; give a shorter --duration"
+        )
+    needed = _LEAST_SAMPLES_EACH * parameters(max(order, 1))
+    if samples < needed:
+        raise IdentificationError(
+            f"{samples!r} samples are used, at least {needed} are needed for order "
+            f"{max(order, 1)}; record more, or ask for a lower order"
+        )
+    return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
+
+
+def excited_parameters(input: FloatArray, most: int) -> int:
+    """Return how many parameters ``input`` (n,) can tell, at most ``most``.
+
+    The order to which it is persistently exciting beside a constant (Ljung 1999, ch. 13): of all
+    windows of ``most`` samples, how many are independent. Each sine gives two; noise, all.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(input, most)
+    varied = windows - np.mean(windows, axis=0)
+    power = np.linalg.eigvalsh(varied.T @ varied)
+    return int(np.sum(power > _UNEXCITED * power[-1]))
+
+
+def _most_excited(input: FloatArray, most: int, order: int) -> int:
+    """Return the highest order, at most ``most``, whose numerator and denominator show."""
+    excited = excited_parameters(input, min(2 * most + 1, len(input)))
+    if excited < 2 * max(order, 1) + 1:
+        raise IdentificationError(
+            f"the input excites {excited!r} parameters only, {2 * max(order, 1) + 1!r} are needed "
+            f"for order {max(order, 1)}: each of its frequencies tells a gain and a phase; record "
+            "with steps, noise, or more frequencies at once"
+        )
+    return min(most, (excited - 1) // 2)
+
+
+def parts(used: BoolArray) -> FloatArray:
+    """Return in which part, 0 to _PARTS, each used sample lies, with fractions; -1 elsewhere."""
+    place = np.cumsum(used) - 1.0
+    return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
+
+
+def delayed(
+    input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
+) -> HeldProblem:
+    """Return the problem whose ``input`` (n,) comes ``delay`` samples later."""
+    late = np.roll(input, delay)
+    return HeldProblem(
+        input=late - np.mean(late),
+        output=output,
+        used=used & (np.arange(len(used)) >= delay),
+        period=period,
+        background=np.ones((len(output), 1)),
+        rate=RATE_SAMPLES / period,
+    )
+
+
+def _best_delay(
+    input: FloatArray, output: FloatArray, used: BoolArray, period: float, most: int
+) -> int:
+    """Return the whole samples by which a small model is best late."""
+    if most == 0:
+        return 0
+    same = used & (np.arange(len(used)) >= most)
+    sums = []
+    for delay in range(most + 1):
+        problem = delayed(input, output, same, period, delay)
+        starts = DiscreteStarts(problem.input, problem.output, problem.used, _DELAY_ORDER)
+        fits: list[Fit] = []
+        for _ in range(_DELAY_ORDER + 1):
+            fits.append(next_order(problem, fits, starts))
+        sums.append(fits[-1].sum_of_squares)
+    return int(np.argmin(sums))
+
+
+def _explored(
+    early: HeldProblem, late: BoolArray, most: int, at_least: int
+) -> tuple[list[Fit], FloatArray]:
+    """Return fits of rising order and their errors over ``late``; stop when some predict no better.
+
+    at_least: order to go to in any case
+    """
+    fits: list[Fit] = []
+    errors: list[float] = []
+    starts = DiscreteStarts(early.input, early.output, early.used, most)
+    for order in range(most + 1):
+        fits.append(next_order(early, fits, starts))
+        errors.append(_missed(early, fits[-1], late))
+        if order - int(np.argmin(errors)) >= _FRUITLESS and order >= at_least:
+            break
+    return fits, np.array(errors)
+
+
+def next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
+    """Fit as many poles as there are ``smaller`` fits, and return the best."""
+    order = len(smaller)
+    structure = Structure(order, order, False)
+    if order == 0:
+        return fit(problem, structure, [np.empty(0)])
+    larger = grown([f.nonlinear for f in smaller], len(problem.output))
+    return fit(problem, structure, proposed(problem, order, starts) + larger)
+
+
+def refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
+    """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``.
+
+    evaluations: of a fit, as of :func:`fit` if not given
+    """
+    found = fit(problem, start.structure, [start.nonlinear], *evaluations)
+    if not whitened:
+        return found
+    whitener, _ = autoregression(found.residual)
+    if len(whitener) == 1:
+        return found
+    apart = np.arange(len(problem.used)) >= len(whitener)
+    lost = np.convolve(~problem.used, np.ones(len(whitener)))[: len(problem.used)] > 0.5
+    white = replace(
+        problem,
+        input=signal.lfilter(whitener, 1.0, problem.input),
+        output=signal.lfilter(whitener, 1.0, problem.output),
+        used=problem.used & apart & ~lost,
+    )
+    return fit(white, start.structure, [found.nonlinear], *evaluations)
+
+
+def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
+    """Return the mean square error of a free run over samples that are not used in ``problem``."""
+    missed = (problem.output - problem.free_run(fitted))[hidden]
+    value = float(np.mean(missed**2))
+    return value if np.isfinite(value) else np.inf
+
+
+def _finalists(by_order: FloatArray, order: int) -> list[int]:
+    """Return the orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
+    best = np.argsort(by_order, kind="stable")[:_FINALISTS]
+    about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))[:_FINALISTS]
+    return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
+
+
+def hidden_errors(
+    candidate: SampledCandidate, part: FloatArray, evaluations: int = _HIDDEN_EVALUATIONS
+) -> FloatArray:
+    """Return the mean square error over each hidden part, the candidate fitted without it.
+
+    part: in which each sample lies, see :func:`parts`;  evaluations: of that fit
+
+    Some parts lie inside the record and one at its end. Inside alone would misjudge a plant that
+    drifts, because the data hold the model at both ends. No model has to run backwards.
+    """
+    problem, number = candidate.problem, np.floor(part)
+    hidden = [number == i for i in range(1, _PARTS)]
+    hidden += [number >= i for i in range(_PARTS // 2, _PARTS - 1)]
+    errors = []
+    for samples in hidden:
+        rest = replace(problem, used=problem.used & ~samples)
+        found = refitted(rest, candidate.fit, candidate.whitened, evaluations)
+        errors.append(_missed(rest, found, samples))
+    return np.array(errors)
+
+
+def plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
+    """Return the simplest of those that no other beats: not whitened, then with fewest poles.
+
+    One beats another that is better in the mean by more than half a standard error of their
+    difference (after Breiman et al. 1984, paired).
+    """
+    errors = np.array([c.hidden for c in judged])
+    with np.errstate(invalid="ignore"):
+        worse = errors[:, np.newaxis] - errors[np.newaxis]
+        allowed = _BEATS_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
+        unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
+    best = int(np.argmin(np.mean(errors, axis=1)))
+    every = {best, *np.flatnonzero(unbeaten).tolist()}
+    return judged[min(every, key=lambda i: (judged[i].whitened, judged[i].order))]
+
+
+# The model of a long record: chosen on the part that tells most, fitted and judged on the whole.
+#
+# To fit every order to every hidden part of a long record takes minutes, and tells of the order
+# what
+# a few thousand samples tell. What they do not is what is slower than they last, and what is too
+# weak
+# to show in them: so the lowest orders, and two poles more, are fitted to the whole as well.
+
+# Samples that are used, on which is chosen: eighty for each parameter of the highest order.
+CHOSEN_ON = 5000
+# Parts that are compared in how much they tell.
+_MOST_PARTS = 16
+# Fitted to the whole in any case: what is slower than a part.
+_LOWEST = 2
+# and what is too weak for it.
+_POLES_MORE = 2
+# Without a part of a long record a model hardly moves.
+_HIDDEN_EVALUATIONS_LONG_RECORD = 2
+
+
+def choose_of_any_length(
+    input: FloatArray,
+    output: FloatArray,
+    used: BoolArray,
+    period: float,
+    *,
+    order: int = 0,
+    max_delay: int = 0,
+) -> SampledChoice:
+    """Fit sampled models and choose, as :func:`choose_sampled` does, whatever the length."""
+    check_record(input, output, used, order)
+    if int(np.sum(used)) <= CHOSEN_ON:
+        return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
+    part = telling_part(input, used)
+    try:
+        choice = choose_sampled(
+            input[part], output[part], used[part], period, order=order, max_delay=max_delay
+        )
+    except IdentificationError:
+        # No part excites as much as the whole does.
+        return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
+    centred = np.where(used, output - np.mean(output[used]), 0.0)
+    return _on_the_whole(delayed(input, centred, used, period, choice.delay), choice)
+
+
+def telling_part(input: FloatArray, used: BoolArray) -> slice:
+    """Return the part with CHOSEN_ON samples ``used`` (n,) in which ``input`` (n,) excites most."""
+    places = np.flatnonzero(used)
+    count = len(places) // CHOSEN_ON
+    tried = np.unique(np.linspace(0, count - 1, min(count, _MOST_PARTS)).astype(int))
+    every = [
+        slice(int(places[i * CHOSEN_ON]), int(places[(i + 1) * CHOSEN_ON - 1]) + 1) for i in tried
+    ]
+
+    def told(part: slice) -> tuple[int, float]:
+        varied = input[part]
+        excited = excited_parameters(varied, 2 * MAX_ORDER + 1) if np.ptp(varied) > 0 else 0
+        return excited, float(np.var(varied))
+
+    return max(every, key=told)
+
+
+def _on_the_whole(problem: HeldProblem, choice: SampledChoice) -> SampledChoice:
+    part = parts(problem.used)
+    starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
+    lowest: list[Fit] = []
+    while len(lowest) <= _LOWEST:
+        lowest.append(next_order(problem, lowest, starts))
+    tried = [SampledCandidate(problem, f, f.structure.poles, False, np.empty(0)) for f in lowest]
+    free = _of_part(problem, choice.free)
+    tried += [free, *_with_poles_more(problem, free, starts)]
+    judged = [
+        replace(c, hidden=hidden_errors(c, part, _HIDDEN_EVALUATIONS_LONG_RECORD)) for c in tried
+    ]
+    best = plainest(judged)
+    if choice.chosen is choice.free:
+        return replace(choice, chosen=best, free=best)
+    asked = _of_part(problem, choice.chosen)
+    asked = replace(asked, hidden=hidden_errors(asked, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
+    return replace(choice, chosen=asked, free=best)
+
+
+def _of_part(problem: HeldProblem, found: SampledCandidate) -> SampledCandidate:
+    """Return the candidate that was ``found`` on a part, fitted to the whole ``problem``."""
+    return replace(found, problem=problem, fit=refitted(problem, found.fit, found.whitened))
+
+
+def _with_poles_more(
+    problem: HeldProblem, found: SampledCandidate, starts: DiscreteStarts
+) -> list[SampledCandidate]:
+    order = found.order + _POLES_MORE
+    if order > MAX_ORDER:
+        return []
+    grown = found.fit.nonlinear
+    for _ in range(_POLES_MORE):
+        grown = with_fast_pole(grown)
+    larger = fit(
+        problem, Structure(order, order, False), [*proposed(problem, order, starts), grown]
+    )
+    return [replace(found, fit=larger, order=order, whitened=False)]

@@ -1,0 +1,185 @@
+"""The steps in a motion: where they are, what lies between them, and which to hold out.
+
+No number, size, direction or rate of steps is assumed. A motion without plateaus (a
+chirp, a scan) has no edges; it identifies as well, by its own content.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import special
+
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.motion_record import MotionRecord
+from omsm_ros.errors import StepTestError
+from omsm_ros.readable import counted, quantity
+
+# A fit of even one parameter with its offset, drift and gain needs a multiple of them.
+LEAST_SAMPLES = 50
+# A step test of ten seconds at 70 kHz; each takes 1.3 kB in a fit and its covariance.
+_MOST_SAMPLES = 800_000
+# Far beyond the range of any probe that could have seen the motion.
+_GREATEST_TRAVEL_M = 20e-3
+# Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
+NOISE_FACTOR = 20.0
+TRAVEL_PART = 2e-3
+_DIFFERENCES = (2, 4, 6, 8)
+# Rest is the axis staying put for this long, and an edge ends when it begins.
+_REST_S = 20e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A move from rest to rest: samples ``start`` to ``stop`` (exclusive), ``height`` [m]."""
+
+    start: int
+    stop: int
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The edges of a motion (n,), its rests, and its noise.
+
+    moving: True from an edge's start to its stop, shape (n,)
+    noise: standard deviation of one encoder sample [m]
+    travel: [m]
+    """
+
+    edges: tuple[Edge, ...]
+    moving: BoolArray
+    noise: float
+    travel: float
+
+
+def sample_noise(values: FloatArray) -> float:
+    """Return the standard deviation of white noise on a smooth signal, from its differences.
+
+    Motion adds to the differences of each order, to the lowest most, so the smallest estimate is
+    taken. Each is a median, to which the few samples at edges do not matter.
+    """
+    orders = [order for order in _DIFFERENCES if order < len(values)]
+    return min((_difference_noise(values, order) for order in orders), default=0.0)
+
+
+def _difference_noise(values: FloatArray, order: int) -> float:
+    # MAD of a normal distribution is 0.6745 σ; k-th differences have variance C(2k, k) σ².
+    middle = float(np.median(np.abs(np.diff(values, order))))
+    return middle / 0.6745 / float(np.sqrt(special.comb(2 * order, order)))
+
+
+def find_steps(z: FloatArray, sample_period: float) -> Steps:
+    """Return the edges of ``z`` (n,) [m] sampled every ``sample_period`` [s].
+
+    Raises StepTestError when the axis does not move, or moves farther than any probe sees.
+    """
+    _check_length(len(z))
+    noise, travel = sample_noise(z), float(np.ptp(z))
+    if travel > _GREATEST_TRAVEL_M:
+        raise StepTestError(
+            f"Z travels {quantity(travel, 'm')}, a probe follows a fixed target over "
+            f"{quantity(_GREATEST_TRAVEL_M, 'm')} at most; positions must be in metres"
+        )
+    if travel <= max(NOISE_FACTOR * noise, 1e-12):
+        raise StepTestError(
+            f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: no steps; "
+            "run the step test while recording"
+        )
+    moving = _moving(z, sample_period, max(NOISE_FACTOR * noise, TRAVEL_PART * travel))
+    return Steps(_edges(z, moving), moving, noise, travel)
+
+
+def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
+    """Return True where z leaves its value by more than ``threshold`` within a rest's duration."""
+    width = min(max(round(_REST_S / sample_period), 2), len(z) - 1)
+    changes = np.abs(z[width:] - z[:-width]) > threshold
+    # A change between k and k + width lies anywhere between: close the window over it.
+    return lasting(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
+
+
+def lasting(flags: BoolArray, samples: int) -> BoolArray:
+    """Return True where ``flags`` (n,) is, and for ``samples`` after it, (n,)."""
+    count = np.concatenate([[0], np.cumsum(flags)])
+    before = np.maximum(np.arange(len(flags)) - samples, 0)
+    return np.asarray(count[1:] > count[before])
+
+
+def _edges(z: FloatArray, moving: BoolArray) -> tuple[Edge, ...]:
+    flags = np.diff(np.concatenate([[0], moving.astype(np.int8), [0]]))
+    starts, stops = np.flatnonzero(flags == 1), np.flatnonzero(flags == -1)
+    if len(starts) == 0:
+        return ()
+    bounds = np.concatenate([[0], np.ravel(np.column_stack([starts, stops])), [len(z)]])
+    levels = [
+        float(np.mean(z[a:b])) if b > a else float(z[min(a, len(z) - 1)])
+        for a, b in zip(bounds[::2], bounds[1::2], strict=True)
+    ]
+    return tuple(
+        Edge(int(start), int(stop), levels[i + 1] - levels[i])
+        for i, (start, stop) in enumerate(zip(starts, stops, strict=True))
+        if start > 0 and stop < len(z)
+    )
+
+
+def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]]:
+    """Return the record cut midway between edges, one edge a piece.
+
+    With fewer than ``least`` edges it is cut into twice as many equal parts instead.
+    """
+    if len(steps.edges) >= least:
+        middles = [(before.stop + after.start) // 2 for before, after in pairwise(steps.edges)]
+        cuts = [0, *middles, samples]
+    else:
+        cuts = [round(samples * i / (2 * least)) for i in range(2 * least + 1)]
+    return list(pairwise(cuts))
+
+
+def held_out(steps: Steps, samples: int) -> BoolArray:
+    """Return True in the segment of every third edge, (n,): both directions are held out."""
+    mask = np.zeros(samples, np.bool_)
+    for start, stop in segments(steps, samples)[1::3]:
+        mask[start:stop] = True
+    return mask
+
+
+def backlash_columns(steps: Steps, samples: int) -> FloatArray:
+    """Return the direction of the last move, and a mark of the time before the first, (n, 1 or 2).
+
+    A backlash of b shifts the output by ±b/2 with the direction of approach.
+    """
+    if not steps.edges:
+        return np.empty((samples, 0))
+    direction = np.zeros(samples)
+    for edge in steps.edges:
+        direction[edge.start :] = np.sign(edge.height)
+    if np.all(direction[steps.edges[0].start :] == direction[-1]):
+        return np.empty((samples, 0))
+    before = (np.arange(samples) < steps.edges[0].start).astype(np.float64)
+    return np.column_stack([direction, before])
+
+
+def check_usable(record: MotionRecord) -> None:
+    """Raise StepTestError for too few samples that can be used, or too many, saying why."""
+    _check_length(len(record))
+    if len(record) > _MOST_SAMPLES:
+        raise StepTestError(
+            f"{len(record)} samples are more than can be fitted in a gigabyte of memory, "
+            f"{_MOST_SAMPLES}; record a shorter test, or trigger encoder and probe less often"
+        )
+    usable = int(np.sum(record.ok))
+    if usable < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{usable!r} of {len(record)} samples are usable ({counted(record.counts)}); "
+            "check the probe's target and range, and the encoder"
+        )
+
+
+def _check_length(samples: int) -> None:
+    if samples < LEAST_SAMPLES:
+        raise StepTestError(
+            f"{samples} samples are too few to identify anything; "
+            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
+        )

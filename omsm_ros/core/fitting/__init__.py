@@ -1,1 +1,0 @@
-"""Which G(s) describes a recording best: structures, fits, and the choice among them."""

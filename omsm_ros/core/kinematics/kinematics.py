@@ -1,0 +1,159 @@
+"""Where on the workpiece is the probe looking?
+
+Chain: workpiece → C → Y → X → base → Z → B → probe. The frame of the chuck has its third axis
+along the spindle, which is parallel to Z; x and y are slide positions from the spindle axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, SLOPE
+from omsm_ros.units import MICROMETRE_M
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """Where the probe sits and looks; all zero for a probe on the spindle axis, along Z.
+
+    centre_x, centre_y: slide positions at which the probe looks at the spindle axis [m]
+    probe_x, probe_z: from the pivot of B to the point of zero distance, at b = 0 [m]
+    beam_x, beam_y: slope of the beam against Z at b = 0 [1]
+    abbe_arm: from the Z encoder's line to the beam [m]; what an unknown pitch of the slide
+        costs over it is a term of the uncertainty
+    """
+
+    centre_x: float = 0.0
+    centre_y: float = 0.0
+    probe_x: float = 0.0
+    probe_z: float = 0.0
+    beam_x: float = 0.0
+    beam_y: float = 0.0
+    abbe_arm: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            quantity = SLOPE if field.name.startswith("beam") else LENGTH
+            quantity.checked(getattr(self, field.name), ConfigurationError, field.name)
+
+
+class WorkpiecePoints(NamedTuple):
+    """Points in the workpiece frame [m], each (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+
+
+def workpiece_xy(x: FloatArray, y: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Turn positions x, y [m] from the spindle axis back by the spindle angle c [rad], each (n,).
+
+    ``X = x cos c + y sin c``, ``Y = -x sin c + y cos c``.
+    """
+    cosine, sine = np.cos(c), np.sin(c)
+    return x * cosine + y * sine, y * cosine - x * sine
+
+
+def workpiece_points(
+    geometry: Geometry,
+    slides: tuple[FloatArray, FloatArray, FloatArray],
+    b: FloatArray,
+    c: FloatArray,
+    distance: FloatArray,
+) -> WorkpiecePoints:
+    """Return the surface points at which the probe looked.
+
+    slides: x, y and the probe's own z (H(z)) [m], each (n,);  b, c: [rad], (n,)
+    distance: true distance along the beam, growing with the height of the surface [m], (n,)
+    """
+    x, y, z = slides
+    along_x, along_y, along_z = _reach(geometry, b, distance)
+    height = z + along_z
+    return WorkpiecePoints(
+        *workpiece_xy(x - geometry.centre_x + along_x, y - geometry.centre_y + along_y, c), height
+    )
+
+
+def beam_quaternion(geometry: Geometry) -> tuple[float, float, float, float]:
+    """Return the shortest turn (x, y, z, w) of the Z axis onto the beam, at b = 0."""
+    beam = np.array([geometry.beam_x, geometry.beam_y, 1.0])
+    beam /= np.linalg.norm(beam)
+    turn = np.array([-beam[1], beam[0], 0.0, 1.0 + beam[2]])
+    x, y, z, w = (turn / np.linalg.norm(turn)).tolist()
+    return x, y, z, w
+
+
+def _reach(
+    geometry: Geometry, b: FloatArray, distance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the vector from zero distance at b = 0 to the surface point, in the machine frame [m].
+
+    B turns about Y: ``(x, z) -> (x cos b + z sin b, z cos b - x sin b)``.
+    """
+    beam = np.array([geometry.beam_x, geometry.beam_y, 1.0])
+    beam /= np.linalg.norm(beam)
+    x, y, z = (distance * component for component in beam)
+    if not b.any():
+        return x, y, z
+    cosine, sine = np.cos(b), np.sin(b)
+    # 1 - cos b as 2 sin²(b/2): the pivot's arm may be long and b small.
+    versine = 2 * np.sin(b / 2) ** 2
+    return (
+        x * cosine + z * sine + geometry.probe_z * sine - geometry.probe_x * versine,
+        y,
+        z * cosine - x * sine - geometry.probe_x * sine - geometry.probe_z * versine,
+    )
+
+
+# How does the Z slide pitch along its way? A measured curve, and what it does over an arm.
+#
+# An encoder that sits ``arm`` beside the beam sees the slide's motion and ``arm · α`` more (Abbe).
+
+
+@dataclass(frozen=True, eq=False)
+class PitchCurve:
+    """Pitch ``angle`` (k,) [rad] at ``position`` (k,) of Z [m]; straight between, level beyond.
+
+    Raises ConfigurationError unless the positions increase.
+    """
+
+    position: FloatArray
+    angle: FloatArray
+
+    def __post_init__(self) -> None:
+        if len(self.position) < 2 or np.any(np.diff(self.position) <= 0):
+            raise ConfigurationError(
+                "positions of the pitch do not increase; sort them, each once, two or more"
+            )
+
+    def over(self, arm: float, z: FloatArray) -> FloatArray:
+        """Return what an encoder ``arm`` [m] beside the beam reads too much at ``z`` (n,) [m]."""
+        return np.asarray(arm * np.interp(z, self.position, self.angle), np.float64)
+
+
+# What a motion follows and a probe looks at: a height over the plane, and its slopes.
+
+# The slope of a wave of a millimetre is short by 0.07 %, and rounding far below a microradian.
+_STEP_M = 10 * MICROMETRE_M
+
+
+class Surface(Protocol):
+    """Anything with a height over the plane."""
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m], of their broadcast shape."""
+        ...
+
+
+def slopes_by_differences(
+    surface: Surface, x: FloatArray, y: FloatArray, step: float = _STEP_M
+) -> tuple[FloatArray, FloatArray]:
+    """Return ∂z/∂x and ∂z/∂y [1] at x, y [m] by central differences over ``step`` [m] each way."""
+    along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
+    along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
+    return np.asarray(along_x, np.float64), np.asarray(along_y, np.float64)

@@ -1,0 +1,244 @@
+"""How fast can the machine and the probe run a path, apart from its dynamic error?
+
+Each limit compares one quantity of the path with what is allowed, and says how many times
+as fast the same path may be run until the two are equal. Run k times as fast, velocities grow
+by k, accelerations by k² and jerks by k³. What is not declared is named, not assumed harmless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.kinematics.scan_path import ScanPath, content_frequency, steepest
+from omsm_ros.core.lti.discretisation import discretise
+from omsm_ros.core.lti.recursion import through
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import Quantity
+from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
+
+FASTEST = 100.0
+"""No path is said to run more than so many times as fast; nor less than the inverse."""
+
+# A hundredth of a per cent, of the speed or of what it is allowed.
+_PRECISION = 1e-4
+# Of what is allowed: a path that does not move has no logarithm.
+_TINY = 1e-12
+
+# One written in another unit, such as a range of 100 for micrometres, shall not bind nowhere.
+_DECLARED = {
+    "servo_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
+    "probe_range": Quantity("limit", "m", 1e-9, 1.0, "give it in metres"),
+    "spindle_speed_rpm": Quantity("limit", "rpm", 1e-3, 1e6, "give it in turns a minute"),
+    "motion_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
+    "z_acceleration": Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²"),
+    "z_jerk": Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³"),
+    "point_spacing": Quantity("limit", "m", 1e-10, 1.0, "give it in metres"),
+    "exposure": Quantity("limit", "s", 1e-9, 10.0, "give it in seconds"),
+    "timing": Quantity("limit", "s", 1e-15, 1.0, "give it in seconds"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineLimits:
+    """What machine and probe can do; None where nobody has declared it.
+
+    servo_frequency: natural frequency of the Z servo, taken as critically damped [Hz]; typical
+        of a slow tool servo, and that of the paper, are 50 Hz
+    probe_range: over which the probe reads [m];  spindle_speed_rpm: [1/min], the paper's model
+        holds below 120;  motion_frequency: highest content of the Z motion [Hz], the paper's 50
+    z_acceleration: [m/s²];  z_jerk: [m/s³];  point_spacing: along the path [m]
+    exposure: of one reading [s];  timing: standard uncertainty of a trigger [s]
+    """
+
+    servo_frequency: float | None = 50.0
+    probe_range: float | None = 100 * MICROMETRE_M
+    spindle_speed_rpm: float | None = 120.0
+    motion_frequency: float | None = 50.0
+    z_acceleration: float | None = None
+    z_jerk: float | None = None
+    point_spacing: float | None = None
+    exposure: float | None = None
+    timing: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, declared in _DECLARED.items():
+            if (value := getattr(self, name)) is not None:
+                declared.checked(value, ConfigurationError, name)
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedLimit:
+    """One limit of a path.
+
+    value: as the path is;  allowed: at most, in the same ``unit``
+    speed_factor: how many times as fast the path may be run, 0 if at no speed
+    """
+
+    name: str
+    value: float
+    allowed: float
+    unit: str
+    speed_factor: float
+
+
+def highest_factor(
+    value_at: Callable[[float], float], allowed: float, now: float | None = None
+) -> float:
+    """Return the largest speed factor at which ``value_at(factor)``, which rises, is allowed.
+
+    now: ``value_at(1)``, where it is known already
+
+    Between 1 / FASTEST and FASTEST, and never too large; 0 if it is not allowed at any. What
+    grows with a power of the speed is a straight line over logarithms, so that false position
+    (Illinois: an end that stays counts half) needs few of the values, which cost time.
+    """
+
+    def over(value: float) -> float:
+        return float(np.log(max(value / allowed, _TINY)))
+
+    def excess(logarithm: float) -> float:
+        return over(value_at(float(np.exp(logarithm))))
+
+    low = high = 0.0
+    below = above = excess(0.0) if now is None else over(now)
+    if below <= 0:
+        high = float(np.log(FASTEST))
+        if (above := excess(high)) <= 0:
+            return FASTEST
+    else:
+        low = -float(np.log(FASTEST))
+        if (below := excess(low)) > 0:
+            return 0.0
+    stayed = 0
+    while high - low > _PRECISION:
+        middle = low + (high - low) * below / (below - above)
+        found = excess(middle)
+        if found > 0:
+            high, above = middle, found
+            below *= 0.5 if stayed > 0 else 1.0
+            stayed = 1
+        else:
+            low, below = middle, found
+            if found >= -_PRECISION:
+                break
+            above *= 0.5 if stayed < 0 else 1.0
+            stayed = -1
+    return float(np.exp(low))
+
+
+def speed_limits(
+    path: ScanPath,
+    limits: MachineLimits,
+    valid_up_to: float,
+    budget: float,
+    dynamics: TransferFunction | None = None,
+) -> tuple[list[SpeedLimit], list[str]]:
+    """Return the limits that can be evaluated, and the names of those that cannot.
+
+    valid_up_to: frequency to which the calibration is trusted [Hz]
+    dynamics: from encoder to probe, by which the probe leaves the path beyond the servo
+    budget: allowed error of a height, k = 2 [m], for what exposure and timing cost
+    """
+    evaluated, missing = [], []
+    for limit in _all_limits(path, limits, valid_up_to, budget, dynamics):
+        if isinstance(limit, str):
+            missing.append(limit)
+        else:
+            evaluated.append(limit)
+    return evaluated, missing
+
+
+def _all_limits(
+    path: ScanPath,
+    limits: MachineLimits,
+    valid_up_to: float,
+    budget: float,
+    dynamics: TransferFunction | None,
+) -> Iterator[SpeedLimit | str]:
+    content = content_frequency(path.z, path.sample_period)
+    velocity, acceleration, jerk = steepest(path.z, path.sample_period, content)
+    yield _power("calibrated band", content, valid_up_to, "Hz", 1)
+    yield _power("motion frequency", content, limits.motion_frequency, "Hz", 1)
+    yield _following(path, limits, dynamics)
+    yield _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2)
+    yield _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3)
+    yield _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1)
+    yield _power("spacing at the rim", _spacing(path), limits.point_spacing, "m", 1)
+    exposed = None if limits.exposure is None else limits.exposure**2 / 24 * acceleration
+    yield _power("path within one exposure", exposed, budget / 2, "m", 2)
+    late = None if limits.timing is None else limits.timing * velocity
+    yield _power("timing of the trigger", late, budget / 2, "m", 1)
+
+
+def _power(
+    name: str, value: float | None, allowed: float | None, unit: str, power: int
+) -> SpeedLimit | str:
+    """Return the limit of a quantity that grows with a power of the speed, or its name."""
+    if value is None or allowed is None:
+        return name
+    factor = FASTEST if value == 0 else min((allowed / value) ** (1 / power), FASTEST)
+    return SpeedLimit(name, value, allowed, unit, float(factor))
+
+
+def following_error(
+    z: FloatArray,
+    sample_period: float,
+    servo_frequency: float,
+    factor: float = 1.0,
+    dynamics: TransferFunction | None = None,
+) -> float:
+    """Return the largest distance [m] by which the probe leaves the path run at ``factor``.
+
+    The servo is 1 / (1 + s/ω)², and ``dynamics`` what the probe's motion is of the encoder's; run
+    faster, the path is the same over less time.
+    """
+    omega = 2 * np.pi * servo_frequency
+    motion = TransferFunction(np.ones(1), np.array([1.0, 2 / omega, 1 / omega**2]))
+    if dynamics is not None:
+        both = np.asarray(np.convolve(motion.denominator, dynamics.denominator), np.float64)
+        motion = TransferFunction(dynamics.numerator, both, dynamics.delay)
+    moved = through(discretise(motion, sample_period / factor), z)
+    # The past before the first sample is guessed; its response is over after ten time constants.
+    settling = min(int(10 / omega / (sample_period / factor)), len(z) // 2)
+    return float(np.max(np.abs(z - moved)[settling:]))
+
+
+def _following(
+    path: ScanPath, limits: MachineLimits, dynamics: TransferFunction | None
+) -> SpeedLimit | str:
+    name = "probe range against following error"
+    if limits.probe_range is None or limits.servo_frequency is None:
+        return name
+    servo = limits.servo_frequency
+
+    def excursion(factor: float) -> float:
+        return following_error(path.z, path.sample_period, servo, factor, dynamics)
+
+    now, taken, share = excursion(1.0), 0.0, 1.0
+    if path.distance is not None and np.any(np.isfinite(path.distance)):
+        span = float(np.nanmax(path.distance) - np.nanmin(path.distance)) / 2
+        # More than the servo's own error is shape, tilt and set-up, whatever the speed; less
+        # shows a servo that is better than declared.
+        taken, share = max(span - now, 0.0), min(span / now, 1.0) if now else 1.0
+    value, allowed = share * now + taken, limits.probe_range / 2
+    factor = highest_factor(lambda k: share * excursion(k) + taken, allowed, value)
+    return SpeedLimit(name, value, allowed, "m", factor)
+
+
+def _spindle_rpm(path: ScanPath) -> float | None:
+    if path.c is None:
+        return None
+    return float(abs(path.c[-1] - path.c[0]) / ((len(path.c) - 1) * path.sample_period) / RPM_RAD_S)
+
+
+def _spacing(path: ScanPath) -> float | None:
+    """Return the largest distance between neighbouring points [m], over the chuck's plane."""
+    if path.x is None or path.c is None:
+        return None
+    radius = 0.5 * np.abs(path.x[1:] + path.x[:-1])
+    return float(np.max(np.hypot(np.diff(path.x), radius * np.diff(path.c))))

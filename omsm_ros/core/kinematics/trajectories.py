@@ -1,0 +1,361 @@
+"""Motions of the cell as functions of time, such as a machine can run.
+
+Each motion gives the commanded axes at any time, also before its start: a machine is
+already moving when the first trigger comes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.readable import count, quantity
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, RPM_HZ, RPM_RAD_S
+
+
+class AxisPositions(NamedTuple):
+    """Commanded positions, each of the shape of the time they were asked for: m, m, m, rad, rad."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+
+class Motion(Protocol):
+    """A motion of the cell of ``duration`` [s]."""
+
+    @property
+    def duration(self) -> float:
+        """From the first commanded position to the last [s]."""
+        ...
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]; negative before the start."""
+        ...
+
+
+def s_curve(phase: FloatArray) -> FloatArray:
+    """Return rest-to-rest move from 0 to 1 over ``phase`` 0…1 with a jerk of constant magnitude.
+
+    The jerk is ±32 (per unit of phase cubed) with signs + - - + over the four quarters.
+    """
+    p = np.clip(phase, 0.0, 1.0)
+    mirrored = np.where(p > 0.5, 1.0 - p, p)
+    late = mirrored - 0.25
+    # Products, for a power of three takes ten times as long.
+    first = 16 / 3 * (mirrored * mirrored * mirrored)
+    second = 1 / 12 + late * (1 + late * (4 - 16 / 3 * late))
+    half = np.where(mirrored < 0.25, first, second)
+    return np.where(p > 0.5, 1.0 - half, half)
+
+
+def _z_only(z: FloatArray) -> AxisPositions:
+    zero = np.zeros_like(z)
+    return AxisPositions(zero, zero, z, zero, zero)
+
+
+@dataclass(frozen=True, slots=True)
+class StepTest:
+    """Z climbs ``count`` steps and comes down again, resting ``dwell`` after each edge.
+
+    step: height of a step [m]
+    count: steps up; as many follow down
+    dwell: time from one edge to the next [s]
+    rise: duration of a jerk-limited edge [s]; 0 is a sharp edge
+    """
+
+    step: float = 9.8e-6
+    count: int = 10
+    dwell: float = 0.5
+    rise: float = 20e-3
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or not self.dwell > self.rise >= 0:
+            raise ConfigurationError(
+                f"step test: count {self.count!r} must be 1 or more and dwell {self.dwell!r} s "
+                f"longer than rise {self.rise!r} s, which is not negative"
+            )
+
+    @property
+    def duration(self) -> float:
+        """[s], with one dwell of rest before the first edge."""
+        return self.dwell * (2 * self.count + 1)
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        # Rest before the first edge and after the last one are edges of no height.
+        levels = np.r_[np.zeros(1), np.arange(self.count + 1), np.arange(self.count)[::-1]]
+        edge = np.floor(time / self.dwell)
+        index = np.clip(edge, 0, 2 * self.count).astype(np.int64)
+        since = time - index * self.dwell
+        if self.rise > 0:
+            progress = s_curve(since / self.rise)
+        else:
+            progress = (since >= 0).astype(np.float64)
+        before, after = levels[index], levels[index + 1]
+        return _z_only(self.step * (before + (after - before) * progress))
+
+
+@dataclass(frozen=True, slots=True)
+class Spiral:
+    """X feeds from ``start_radius`` to the centre while C turns and Z follows ``surface``.
+
+    start_radius: [m];  feed_per_turn: [m];  spindle_speed: [rpm], negative reverses.
+    Before its start the motion is a circle at the start radius.
+    """
+
+    surface: Surface
+    start_radius: float
+    feed_per_turn: float
+    spindle_speed: float
+
+    def __post_init__(self) -> None:
+        if self.start_radius <= 0 or self.feed_per_turn <= 0 or self.spindle_speed == 0:
+            raise ConfigurationError(
+                f"spiral: start_radius {self.start_radius!r} m and feed_per_turn "
+                f"{self.feed_per_turn!r} m must be positive, spindle_speed "
+                f"{self.spindle_speed!r} rpm not zero"
+            )
+        if self.feed_per_turn > self.start_radius:
+            raise ConfigurationError(
+                f"spiral: a feed of {self.feed_per_turn!r} m a turn from a radius of "
+                f"{self.start_radius!r} m makes not one turn; give a smaller feed, or a larger "
+                "radius"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Time until X reaches the centre [s]."""
+        return self.start_radius / (self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ)
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        feed = self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ * np.maximum(time, 0.0)
+        x = self.start_radius - feed
+        return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """``turns`` turns at constant ``radius`` [m] and ``spindle_speed`` [rpm], Z on ``surface``."""
+
+    surface: Surface
+    radius: float
+    spindle_speed: float
+    turns: float = 1.0
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.turns / (abs(self.spindle_speed) * RPM_HZ)
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        x = np.full_like(time, self.radius)
+        return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
+
+
+def _on_surface(surface: Surface, x: FloatArray, c: FloatArray) -> AxisPositions:
+    zero = np.zeros_like(x)
+    # Kinematics with y = b = 0: the probe is over X = x cos c, Y = -x sin c of the workpiece.
+    z = surface.height(x * np.cos(c), -x * np.sin(c))
+    return AxisPositions(x, zero, z, zero, c)
+
+
+@dataclass(frozen=True, slots=True)
+class Chirp:
+    """Z swings with constant amplitude while its frequency rises linearly (the paper's Fig. 9).
+
+    peak_to_peak: [m];  start_frequency, end_frequency: [Hz];  duration: [s]
+    """
+
+    peak_to_peak: float = 40e-6
+    start_frequency: float = 0.0
+    end_frequency: float = 15.0
+    duration: float = 25.0
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]; at rest before the start."""
+        running = np.maximum(time, 0.0)
+        sweep = (self.end_frequency - self.start_frequency) / self.duration
+        turns = self.start_frequency * running + 0.5 * sweep * running**2
+        return _z_only(0.5 * self.peak_to_peak * np.cos(2 * np.pi * turns))
+
+
+@dataclass(frozen=True, slots=True)
+class Multisine:
+    """Z swings at several ``frequencies`` [Hz] at once, each with ``amplitude`` [m].
+
+    Their phases keep the peak low (Schroeder 1970). Before its start it swings already.
+    """
+
+    frequencies: tuple[float, ...] = (0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9)
+    amplitude: float = 3e-6
+    duration: float = 20.0
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        count, z = len(self.frequencies), np.zeros_like(time)
+        for k, frequency in enumerate(self.frequencies):
+            z = z + np.cos(2 * np.pi * frequency * time - np.pi * k * k / count)
+        return _z_only(self.amplitude * z)
+
+
+# A step test that a machine can run and that hides nothing between samples.
+#
+# Edges are jerk-limited S-curves, and each starts at another fraction of the sample period,
+# so that what still folds does not fold alike every time.
+
+# The golden ratio's fraction spreads any number of edges evenly over the sample period.
+_GOLDEN = 0.6180339887498949
+# An S-curve of this many samples has nothing worth naming beyond half the rate.
+_LEAST_RISE_SAMPLES = 10
+# What `omsm plan steps` makes: 90 µm of travel with steps of two heights, and a minute, after
+# which a relaxation as slow as the test itself is open by 12 ppm (10 nm of noise at 1 kHz).
+PLANNED_COUNT = 14
+PLANNED_DWELL_S = 2.0
+# A second height that is no simple part of the first: 3 µm beside 9.8 µm.
+SECOND_SHARE = 3 / 9.8
+# A quarter of an hour at 1 kHz, thirty megabytes.
+_MOST_LINES = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class StepPlan:
+    """Start of each edge [s], height of each [m], its rise [s], and the whole duration [s].
+
+    It is a motion of the cell like any in :mod:`omsm_ros.core.kinematics.trajectories`.
+    Raises ConfigurationError where an edge starts before the one before it has ended.
+    """
+
+    starts: tuple[float, ...]
+    heights: tuple[float, ...]
+    rise: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        if np.any(np.diff(self.starts) < self.rise):
+            raise ConfigurationError(
+                f"step plan: an edge starts within the rise of {self.rise!r} s of the one before "
+                "it; leave a rest between edges"
+            )
+
+    @property
+    def travel(self) -> float:
+        """From the lowest plateau to the topmost [m]."""
+        return float(np.ptp(np.cumsum([0.0, *self.heights])))
+
+    def z(self, time: FloatArray) -> FloatArray:
+        """Return the commanded position [m] at ``time`` [s], of the same shape."""
+        starts, heights = np.asarray(self.starts), np.asarray(self.heights)
+        levels = np.concatenate([[0.0], np.cumsum(heights)])
+        edge = np.maximum(np.searchsorted(starts, time, side="right") - 1, 0)
+        phase = (time - starts[edge]) / self.rise
+        progress = np.ones_like(phase)
+        # An edge takes a hundredth of its rest: there is next to nothing to evaluate.
+        moving = phase < 1
+        progress[moving] = s_curve(phase[moving])
+        return np.asarray(levels[edge] + heights[edge] * progress)
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]; only Z moves."""
+        zero = np.zeros_like(time)
+        return AxisPositions(zero, zero, self.z(time), zero, zero)
+
+
+def plan_steps(
+    *,
+    sample_period: float,
+    step: float = 9.8e-6,
+    second_step: float | None = None,
+    count: int = 10,
+    dwell: float = 0.5,
+    rise: float = 20e-3,
+    half_range: float = 50e-6,
+) -> StepPlan:
+    """Return ``count`` steps up and as many down, dithered within ``sample_period`` [s].
+
+    Half of the way up, all of it down, half of it up again: a motion about the middle of its
+    travel separates a slow relaxation from a drift twice as well as one to its end and back.
+
+    step: [m];  second_step: of every other one [m], None for equal steps: two heights
+        separate what is not linear (backlash, friction, stiffening) from what only lags
+    dwell: from edge to edge [s], as long as the slowest relaxation to be separated from gain
+    rise: of an edge [s]
+    half_range: of the probe [m], which must hold the whole travel
+
+    Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
+    """
+    if rise < _LEAST_RISE_SAMPLES * sample_period:
+        raise ConfigurationError(
+            f"step plan: rise {rise!r} s is too sharp for samples every {sample_period!r} s; "
+            f"use at least {_LEAST_RISE_SAMPLES * sample_period!r} s"
+        )
+    upward = np.where(np.arange(count) % 2, step if second_step is None else second_step, step)
+    travel = float(np.sum(upward))
+    if travel > 2 * half_range:
+        raise ConfigurationError(
+            f"step plan: {count!r} steps travel {quantity(travel, 'm')}, which leaves the probe's "
+            f"range of ±{quantity(half_range, 'm')}; use fewer or smaller steps"
+        )
+    if dwell < 3 * rise:
+        raise ConfigurationError(
+            f"step plan: dwell {dwell!r} s leaves no rest after a rise of {rise!r} s; "
+            f"dwell {3 * rise!r} s or longer"
+        )
+    edges = np.arange(1, 2 * count + 1)
+    dither = (edges * _GOLDEN) % 1.0 * sample_period
+    middle = count // 2
+    heights = np.concatenate([upward[middle:], -upward[::-1], upward[:middle]])
+    return StepPlan(
+        tuple((edges * dwell + dither).tolist()),
+        tuple(heights.tolist()),
+        rise,
+        float(dwell * (2 * count + 1)),
+    )
+
+
+def plan_csv(plan: StepPlan, period: float) -> str:
+    """Return ``time_s,z_m`` lines every ``period`` [s], a header first.
+
+    Raises ConfigurationError for more lines than a controller takes.
+    """
+    if plan.duration > _MOST_LINES * period:
+        raise ConfigurationError(
+            f"step plan: {quantity(plan.duration, 's')} every {quantity(period, 's')} are "
+            f"{count(round(plan.duration / period))} lines, at most {count(_MOST_LINES)}; "
+            "plan fewer steps or shorter rests"
+        )
+    time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
+    rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]
+    return "\n".join(["time_s,z_m", *rows]) + "\n"
+
+
+def plan_gcode(plan: StepPlan) -> str:
+    """Return the plan as G-code in millimetres: each edge a G1 at its mean feed, then a G4 dwell.
+
+    Jerk is limited by the controller: set its S-curve so that an edge takes ``plan.rise``.
+    """
+    lines = [
+        "; step test for the identification of the measuring loop",
+        f"; {len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
+        "G21 ; millimetres",
+        "G91 ; relative",
+    ]
+    now = 0.0
+    for start, height in zip(plan.starts, plan.heights, strict=True):
+        feed = abs(height) / plan.rise / MILLIMETRE_M * 60
+        lines.append(f"G4 P{start - now:.6f} ; rest, seconds")
+        lines.append(
+            f"G1 Z{height / MILLIMETRE_M:+.6f} F{feed:.4f} ; {height / MICROMETRE_M:+.3f} um"
+        )
+        now = start + plan.rise
+    lines += [f"G4 P{plan.duration - now:.6f}", "G90", "M2"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,1 @@
+"""Linear systems: G(s), H(z), bands, modes."""

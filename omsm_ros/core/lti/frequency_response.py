@@ -1,0 +1,190 @@
+"""How does one signal answer another? Estimated without a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.units import DEGREE_RAD
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """A response estimated without a model, arrays (k,).
+
+    frequency: [Hz];  coherence: 0-1;  uncertainty: standard, relative
+    """
+
+    frequency: FloatArray
+    response: ComplexArray
+    coherence: FloatArray
+    uncertainty: FloatArray
+
+
+def frequency_response(
+    motion: FloatArray, output: FloatArray, sample_period: float, segment: int
+) -> FrequencyResponse:
+    """Return H1 = S_yu / S_uu by Welch's method, on increments, in segments of ``segment`` samples.
+
+    Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
+    that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
+    """
+    from scipy import signal  # loaded when it is needed: it takes half a second
+
+    du, dy = np.diff(motion), np.diff(output)
+    rate = 1 / sample_period
+    options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
+    frequency, cross = signal.csd(du, dy, **options)
+    _, inward = signal.welch(du, **options)
+    _, coherence = signal.coherence(du, dy, **options)
+    count = max(2 * len(du) / options["nperseg"] - 1, 1.0)
+    inside = np.clip(coherence, 1e-12, 1.0)
+    uncertainty = np.sqrt((1 - inside) / (2 * inside * count))
+    tiny = np.finfo(np.float64).tiny
+    return FrequencyResponse(
+        frequency, np.asarray(cross / np.maximum(inward, tiny)), coherence, uncertainty
+    )
+
+
+# How well is a response known, and up to which frequency is it trusted?
+
+# 95 % of a normal distribution.
+COVERAGE_FACTOR = 1.959964
+# Octaves from one trial frequency to the next.
+_SHOWN_STEP = 1 / 24
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseLimits:
+    """Half-widths of the 95 % band within which a response is trusted: gain [1], phase [rad]."""
+
+    gain: float = 0.005
+    phase: float = 0.5 * DEGREE_RAD
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Standard uncertainty over ``frequency`` [Hz]: relative gain [1] and phase [rad], all (k,)."""
+
+    frequency: FloatArray
+    gain: FloatArray
+    phase: FloatArray
+
+
+def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray) -> FloatArray:
+    """Return d(ln|G|, arg G)/d(numerator, denominator[1:], delay), shape (2, k, p).
+
+    frequency: (k,) [Hz]
+    """
+    s = 2j * np.pi * np.asarray(frequency, np.float64)[:, np.newaxis]
+    up = s ** np.arange(len(dynamics.numerator)) / polynomial.polyval(s, dynamics.numerator)
+    powers = np.arange(1, len(dynamics.denominator))
+    down = -(s**powers) / polynomial.polyval(s, dynamics.denominator)
+    both = np.concatenate([up, down, -s], axis=1)
+    return np.stack([both.real, both.imag])
+
+
+def spread_along(directions: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard deviation along ``directions`` (…, p) of what has ``covariance`` (p, p).
+
+    Shape (…,). What two parameters do alike, such as a delay and a pole far above the band, no data
+    tell apart: they are known to seconds each, and together to microseconds. Where such terms
+    cancel to less than their own rounding, that is what is returned, and not zero.
+    """
+    variance = np.einsum("...p,pq,...q->...", directions, covariance, directions)
+    size = np.abs(directions)
+    rounding = np.finfo(float).eps * np.sum((size @ np.abs(covariance)) * size, axis=-1)
+    return np.asarray(np.sqrt(np.maximum(variance, rounding)))
+
+
+def response_band(
+    dynamics: TransferFunction, covariance: FloatArray, frequency: FloatArray
+) -> Band:
+    """Return the standard uncertainty of gain and phase from the ``covariance`` (p, p) of G."""
+    gain, phase = spread_along(relative_response_jacobian(dynamics, frequency), covariance)
+    return Band(np.asarray(frequency, np.float64), gain, phase)
+
+
+def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> float:
+    """Return the standard uncertainty of the delay τ + d1 - n1/n0 of slow motion [s].
+
+    covariance: (p, p), order numerator, denominator[1:], delay
+    """
+    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
+    gradient = np.zeros(zeros + poles + 2)
+    gradient[-1] = 1.0
+    if zeros:
+        gradient[0] = dynamics.numerator[1] / dynamics.numerator[0] ** 2
+        gradient[1] = -1 / dynamics.numerator[0]
+    if poles:
+        gradient[zeros + 1] = 1.0
+    return float(spread_along(gradient, covariance))
+
+
+def widening(band: Band, other: Band, apart: ComplexArray) -> float:
+    """Return the least factor, at least 1, by which ``band`` must grow to hold all of ``other``.
+
+    apart: ln of the other's response over that of ``band``, at the same frequencies (k,)
+    """
+    parts = ((band.gain, other.gain, apart.real), (band.phase, other.phase, apart.imag))
+    factors = [
+        (np.abs(off) / COVERAGE_FACTOR + theirs)[own > 0] / own[own > 0]
+        for own, theirs, off in parts
+    ]
+    return float(np.max(np.concatenate([[1.0], *factors])))
+
+
+def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None) -> float:
+    """Return the frequency [Hz] up to which the 95 % band stays inside ``limits``; 0 if nowhere.
+
+    other: further error at the same frequencies, added to the half-width, or None
+    """
+    gain, phase = COVERAGE_FACTOR * band.gain, COVERAGE_FACTOR * band.phase
+    if other is not None:
+        gain, phase = gain + other.gain, phase + other.phase
+    outside = np.flatnonzero((gain > limits.gain) | (phase > limits.phase))
+    if len(outside) == 0:
+        return float(band.frequency[-1])
+    return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
+
+
+def would_show(
+    centres: FloatArray,
+    frequency: FloatArray,
+    answer: ComplexArray,
+    noise: FloatArray,
+    limits: ResponseLimits,
+) -> BoolArray:
+    """Return whether the data would show a response off by ``limits`` at ``centres`` (c,) [Hz].
+
+    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
+    noise: mean square of the transform of the probe's noise, (k,)
+    Where they would not, a model interpolates or extrapolates, and what it misses there shows in
+    no residual. Taken over a third of an octave: a deviation δ of G adds δ · answer, so its best
+    estimate has the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    """
+    power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
+    edges = np.outer([2 ** (-1 / 6), 2 ** (1 / 6)], centres)
+    first = np.searchsorted(frequency, edges[0])
+    # At low frequency no line may lie within a third of an octave: then the next one.
+    last = np.maximum(np.searchsorted(frequency, edges[1], side="right"), first + 1)
+    near = [slice(*ends) for ends in zip(first, last, strict=True)]
+    energy = np.array([np.sum(power[part]) for part in near])
+    disturbed = np.array([power[part] @ noise[part] for part in near])
+    return np.asarray(energy * allowed > np.sqrt(0.5 * disturbed), np.bool_)
+
+
+def shown_up_to(
+    frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
+) -> float:
+    """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
+
+    Arguments as of :func:`would_show`; 0 where they show it nowhere.
+    """
+    centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
+    found = np.flatnonzero(would_show(centres, frequency, answer, noise, limits))
+    return float(centres[found[0]]) if len(found) else 0.0

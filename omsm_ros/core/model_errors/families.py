@@ -1,0 +1,435 @@
+"""In which ways may a machine depart from a linear, steady G(s), and how would it look?
+
+Each family gives columns (n, c) of what it adds to the probe's reading, per unit of its size:
+metres for errors of position, a share of the response for relaxations and modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy import fft, signal
+
+from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.steps import Steps, backlash_columns
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import FloatArray
+
+# What depends on where a motion turned last: backlash (a gap), and friction before it slides.
+#
+# Both depend on reversals only, not on time. A reversal counts once the motion has gone back by a
+# few times its noise; so noise at rest changes nothing.
+
+# What noise does beyond is far less than any gap looked for; a wider one would lose reversals.
+_NOISE_HALF_GAP = 2.0
+
+
+def without_noise(motion: FloatArray, noise: float) -> FloatArray:
+    """Return ``motion`` (n,) [m] without the reversals of ``noise`` [m], its deviation."""
+    return through_gap(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
+
+
+def through_gap(motion: FloatArray, half: float) -> FloatArray:
+    """Return the output (n,) of a gap of ±``half`` [m] that ``motion`` (n,) drives."""
+    change = np.diff(motion, prepend=motion[0])
+    moved = np.flatnonzero(change)
+    if len(moved) == 0:
+        return motion.copy()
+    # Along a run of one direction only its end counts.
+    back = change[moved] < 0
+    turns = moved[np.flatnonzero(back[1:] != back[:-1])]
+    del change, moved  # of a long record, memory for what follows
+    ends = np.append(turns, len(motion) - 1)
+    state, states = float(motion[0]), []
+    for end in motion[ends].tolist():
+        states.append(state)
+        state = min(max(state, end - half), end + half)
+    held = np.repeat(states, np.diff(ends, prepend=-1))
+    near = motion - half
+    np.maximum(held, near, out=held)
+    near += 2 * half
+    return np.asarray(np.minimum(held, near, out=held))
+
+
+def lost_in_gaps(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
+    """Yield the lead of ``motion`` (n,) over half of each gap [m], -1 to 1, and its start column.
+
+    Until the whole gap is crossed, what is ahead depends on where in it the motion began.
+    """
+    crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
+    for gap in gaps:
+        yield (motion - through_gap(motion, 0.5 * gap)) / (0.5 * gap)
+        yield np.clip(1.0 - crossed / gap, 0.0, 1.0)
+
+
+def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
+    """Return the friction force along ``motion`` (n,), -1 to 1, and the decay of its start value.
+
+    dF/dx = (1 - F sgn v) / travel (Dahl 1968).
+    """
+    change = np.diff(motion, prepend=motion[0])
+    kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
+    moved = change != 0
+    value, values = 0.0, []
+    for way, part in zip(direction[moved].tolist(), kept[moved].tolist(), strict=True):
+        value = way + (value - way) * part
+        values.append(value)
+    force = np.zeros(len(motion))
+    force[moved] = values
+    last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
+    return force[last], np.cumprod(kept)
+
+
+# One way in which a machine may depart from a linear, steady response, and a family of such.
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One departure from a linear, steady response.
+
+    parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
+    trials: how many independent ones its family tries, for the probability of the best
+    damping: of a mode, else 0
+    columns: (n, c), added to the reading per unit
+    """
+
+    family: str
+    parameter: float
+    trials: float
+    columns: FloatArray
+    damping: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Terms of one kind.
+
+    part: columns (n, terms · c) of the terms from one index to another, side by side, made when
+        they are asked for: all of a long record's would be gigabytes
+    width: columns of one term, c
+    """
+
+    name: str
+    parameters: FloatArray
+    trials: float
+    part: Callable[[int, int], FloatArray]
+    width: int
+    dampings: FloatArray | None = None
+
+    @classmethod
+    def of(cls, name: str, parameters: FloatArray, trials: float, columns: FloatArray) -> Family:
+        """Return the terms whose ``columns`` (n, terms · c) are known."""
+        width = int(columns.shape[1] // len(parameters))
+
+        def part(first: int, last: int) -> FloatArray:
+            # A copy: a term outlives its family, and a view would keep all of that.
+            return columns.T[first * width : last * width].copy().T
+
+        return cls(name, parameters, trials, part, width)
+
+    @property
+    def columns(self) -> FloatArray:
+        """Those of all terms, (n, terms · c)."""
+        return self.part(0, len(self.parameters))
+
+    def term(self, index: int) -> Term:
+        """Return the term at ``index``."""
+        damping = 0.0 if self.dampings is None else float(self.dampings[index])
+        parameter = float(self.parameters[index])
+        columns = self.part(index, index + 1)
+        return Term(self.name, parameter, self.trials, columns, damping)
+
+
+CREEP, MODE = "creep", "soft mode"
+BACKLASH, FRICTION = "backlash", "friction"
+STIFFENING, LINEARITY, PERIODIC = "stiffening", "probe linearity", "periodic probe error"
+VIBRATION, DRIFT = "vibration", "drift"
+
+# Below this a relaxation is no slower than the structure itself.
+FASTEST_CREEP_S = 20e-3
+# Neighbours a factor of 1.6 apart look the same within a few per cent; so few are tried.
+_CREEPS_A_DECADE = 5
+# A line of damping ζ is 2ζ wide, and so far apart are neighbours.
+_DAMPINGS = (0.03, 0.15)
+# Faster modes are poles of the structure, which the choice of order finds.
+FASTEST_MODE_HZ = 100.0
+# Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
+_SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
+# Values a sample at which a reversal is looked for: at 0.2 m/s² half a nanometre is missed.
+_FINER = 8
+# A motion crosses any of them in about a sample, so few do.
+_GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
+# Of a period in the travel: 98 µm in steps make 1 µm, a fringe of a scale or of an interferometer.
+_MOST_CYCLES = 100
+# A period half a cycle off leaves as much as it takes, and would call for a second one.
+_BETWEEN_CYCLES = 37
+# The best of periods between independent ones is the best of so many times as many (Davies 1987).
+_OVERLAP = 3.0
+# Of Legendre polynomials: from a bend to two periods over the record, where lines begin. More of
+# them would follow a staircase, and hide a relaxation in it.
+_DRIFT_DEGREES = (2, 3, 4, 6, 8)
+# Of a line over the record: a drift has fewer.
+_FEWEST_PERIODS = 2
+# Of vibration at a time: the next round looks for more.
+_LINES_TRIED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Departures:
+    """All families for the fit ``fitted`` of ``problem``.
+
+    slower: than the record, by so much may a relaxation be
+    """
+
+    problem: Problem
+    fitted: Fit
+    steps: Steps
+    slower: float = 1.0
+
+    def families(self, only: Collection[str] = ()) -> Iterator[Family]:
+        """Return the families that this motion could show at all, or those named of them."""
+        turning = cache(self._turning)  # as long as families are asked for: it is large
+        makers: dict[str, Callable[[], Iterator[Family]]] = {
+            CREEP: lambda: iter([self.creep()]),
+            MODE: lambda: iter([self.modes()]),
+            VIBRATION: lambda: iter([self.vibration()]),
+            DRIFT: self.drift,
+            LINEARITY: lambda: iter([self.linearity()]),
+            STIFFENING: lambda: iter([self.stiffening()]),
+            PERIODIC: lambda: iter([self.periodic()]),
+            FRICTION: lambda: self.friction(turning),
+            BACKLASH: lambda: self.backlash(turning),
+        }
+        for name, make in makers.items():
+            if not only or name in only:
+                yield from make()
+
+    def again(self, term: Term) -> Term:
+        """Return the ``term`` of another fit with the columns that it has in this one."""
+        for family in self.families((term.family,)):
+            for index in np.flatnonzero(family.parameters == term.parameter):
+                return family.term(int(index))
+        return term
+
+    def alike(self, family: Family) -> Family:
+        """Return the terms of ``family``, of the same record, as this fit has them."""
+        if family.name == CREEP:
+            return self.creep(family.parameters)
+        if family.name == MODE and family.dampings is not None:
+            pairs = zip(family.parameters.tolist(), family.dampings.tolist(), strict=True)
+            return self.modes(list(pairs))
+        if family.name == PERIODIC:
+            return self._of_periods(family.parameters, family.trials)
+        return next(f for f in self.families((family.name,)) if f.width == family.width)
+
+    @property
+    def duration(self) -> float:
+        """Of the record [s]."""
+        return len(self.problem.input) * self.problem.period
+
+    def _in_time(self, spectra: ComplexArray) -> FloatArray:
+        back = fft.irfft(spectra, self.problem.closed_length, axis=-1)
+        return np.asarray(back[..., : len(self.problem.input)].T)
+
+    @cached_property
+    def _answer(self) -> ComplexArray:
+        """Spectrum of what the motion gave, at ``problem.s``; not what rang before the record.
+
+        That is known only as far as it lasts into the samples compared, and is huge before.
+        """
+        return self.problem.output_spectrum(self.fitted)
+
+    def time_constants(self) -> FloatArray:
+        """Return the time constants [s] that are looked for, up to ``slower`` records."""
+        slowest = max(self.slower * self.duration, 2 * FASTEST_CREEP_S)
+        decades = np.log10(slowest / FASTEST_CREEP_S)
+        return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
+
+    def creep(self, time_constants: FloatArray | None = None) -> Family:
+        """Return ``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
+
+        In time and from rest: a relaxation longer than the record remembers how it began.
+        """
+        found = self.time_constants() if time_constants is None else time_constants
+        answer = self._in_time(self._answer)
+
+        def part(first: int, last: int) -> FloatArray:
+            columns = []
+            for step in self.problem.period / found[first:last]:
+                once = relaxed(answer, step)
+                columns += [once - answer, relaxed(once, step) - once]
+            return np.array(columns).T
+
+        return Family(CREEP, found, 3.0, part, 2)
+
+    def modes(self, ladder: Sequence[tuple[float, float]] = ()) -> Family:
+        """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a.
+
+        ladder: frequencies [Hz] and dampings, if not all
+        """
+        found = ladder or self._ladder()
+
+        def part(first: int, last: int) -> FloatArray:
+            return np.concatenate([self.mode(*each).T for each in found[first:last]]).T
+
+        frequencies, dampings = np.array(found).T
+        return Family(MODE, frequencies, len(found) / 2, part, 2, dampings)
+
+    def _ladder(self) -> list[tuple[float, float]]:
+        lowest = 2 / self.duration
+        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
+        return [
+            (frequency, damping)
+            for damping in _DAMPINGS
+            for frequency in _geometric(lowest, max(highest, 2 * lowest), 2 * damping)
+        ]
+
+    def mode(self, frequency: float, damping: float) -> FloatArray:
+        """Return the columns (n, 2) of the mode at ``frequency`` [Hz], as in :meth:`modes`."""
+        s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
+        mode = self._answer / (1 + 2 * damping * s + s * s)
+        return self._in_time(np.array([mode - self._answer, s * mode]))
+
+    def vibration(self) -> Family:
+        """Return the sine and cosine at the strongest lines of the residual."""
+        used = self.problem.used
+        samples = len(used)
+        residual = np.zeros(samples)
+        residual[used] = self.fitted.residual
+        length = 4 * fft.next_fast_len(samples, real=True)
+        power = np.abs(fft.rfft(residual, length)) ** 2
+        # The slowest lines are drift.
+        power[: 4 * _FEWEST_PERIODS] = 0.0
+        time = np.arange(samples) * self.problem.period
+        found = []
+        for _ in range(_LINES_TRIED):
+            peak = int(np.argmax(power))
+            found.append(_vertex(power, peak) / (length * self.problem.period))
+            power[max(peak - 8, 0) : peak + 9] = 0.0
+        angles = 2 * np.pi * np.asarray(found) * time[:, np.newaxis]
+        columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(samples, -1)
+        return Family.of(VIBRATION, np.asarray(found), samples / 2, columns)
+
+    def drift(self) -> Iterator[Family]:
+        """Return polynomials of time beyond the first: slow drift, whatever the axis does."""
+        time = np.linspace(-1.0, 1.0, len(self.problem.input))
+        columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
+        for degree in _DRIFT_DEGREES:
+            scale = np.full(1, self.duration / degree)
+            yield Family.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
+
+    def linearity(self) -> Family:
+        """Return square and cube of the place in the travel: a probe that is not linear.
+
+        Of the place that the probe sees, late as it is: of the axis's own, a scale that changes by
+        a per cent would pass for one per cent of the lag.
+        """
+        motion, seen = self.problem.input, self._in_time(self._answer) / self.fitted.gain
+        middle = 0.5 * (motion.max() + motion.min())
+        place = (seen - middle) / (0.5 * np.ptp(motion) or 1.0)
+        return Family.of(LINEARITY, np.zeros(1), 1.0, np.column_stack([place**2, place**3]))
+
+    def stiffening(self) -> Family:
+        """Return the cube of the deflection (output less input), over its largest value."""
+        answer = self._in_time(self._answer)
+        deflection = answer / self.fitted.gain - self.problem.input
+        deflection = deflection - np.median(deflection)
+        largest = float(np.max(np.abs(deflection))) or 1.0
+        return Family.of(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
+
+    def periodic(self, near: float | None = None) -> Family:
+        """Return sines of the position, with periods from the whole travel to a fraction of it.
+
+        near: a period among those [m], to have periods between it and its neighbours instead
+        """
+        answer = self._in_time(self._answer) / self.fitted.gain
+        travel = float(np.ptp(answer)) or 1.0
+        cycles = np.arange(3, _MOST_CYCLES, dtype=np.float64)
+        trials = _OVERLAP * len(cycles)
+        if near is not None:
+            cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
+        return self._of_periods(travel / cycles, trials)
+
+    def _of_periods(self, periods: FloatArray, trials: float) -> Family:
+        """Return sines of the position of ``periods`` (k,) [m], evenly spaced in their inverse."""
+        angle = 2 * np.pi * self._in_time(self._answer) / self.fitted.gain
+        apart = 1 / periods[1] - 1 / periods[0]
+
+        def part(first: int, last: int) -> FloatArray:
+            # Each is the one before, turned by the same angle.
+            turned, step = np.exp(1j * angle / periods[first]), np.exp(1j * apart * angle)
+            rows = np.empty((2 * (last - first), len(angle)))
+            for row in range(0, len(rows), 2):
+                rows[row], rows[row + 1] = turned.imag, turned.real
+                turned *= step
+            return rows.T
+
+        return Family(PERIODIC, np.asarray(periods), trials, part, 2)
+
+    def friction(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
+        """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
+        if not self.steps.edges:
+            return
+
+        moved = turning()[::_FINER].copy()
+
+        def part(first: int, last: int) -> FloatArray:
+            columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl(moved, t)]
+            return -self.fitted.gain * np.column_stack(columns)
+
+        yield Family(FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, part, 2)
+
+    def _turning(self) -> FloatArray:
+        """Return the position of the structure, ``_FINER`` values a sample.
+
+        A motion reverses between samples, and backlash depends on how far it went.
+        """
+        length = _FINER * self.problem.closed_length
+        answer = _FINER * fft.irfft(self._answer / self.fitted.gain, length)
+        return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
+
+    def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
+        """Return half of the backlash: by the last reversal, and by the last step."""
+
+        def part(first: int, last: int) -> FloatArray:
+            lost = [c[::_FINER] for c in lost_in_gaps(turning(), _GAPS_M[first:last])]
+            return -self.fitted.gain * np.column_stack(lost)
+
+        if self.steps.edges:
+            yield Family(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
+        columns = backlash_columns(self.steps, len(self.problem.input))
+        if columns.shape[1]:
+            yield Family.of(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+
+
+def _vertex(power: FloatArray, peak: int) -> float:
+    """Place of the maximum of ``power`` (n,) at ``peak``, by the parabola of its logarithm.
+
+    Half a line off, a sine leaves a fifth of itself at the ends of the record.
+    """
+    near = power[max(peak - 1, 0) : peak + 2]
+    if len(near) < 3 or np.min(near) <= 0:
+        return float(peak)
+    before, at, after = np.log(near)
+    bend = before - 2 * at + after
+    return peak + float(0.5 * (before - after) / bend) if bend < 0 else float(peak)
+
+
+def _geometric(low: float, high: float, step: float) -> FloatArray:
+    return np.geomspace(low, high, int(np.log(high / low) / step) + 1)
+
+
+def relaxed(values: FloatArray, step: float) -> FloatArray:
+    """Return ``values`` (n,) through 1 / (1 + sτ), at rest before; ``step``: sample period over τ.
+
+    The values run straight from sample to sample.
+    """
+    kept = np.exp(-step)
+    mean = (1 - kept) / step
+    rest = values - values[0]
+    filtered = signal.lfilter([1 - mean, mean - kept], [1.0, -kept], rest)
+    return np.asarray(filtered + values[0])

@@ -1,0 +1,463 @@
+"""How much of a residual would one more term explain, and how large a term would stay hidden?
+
+A score test (Rao 1948): the part of the term's column that the fitted parameters can imitate is
+taken out, and the residual is projected on the rest. Its variance is that of the spectrum of the
+residual *without* the term, because a large term would otherwise count as noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import fft, stats
+
+from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
+from omsm_ros.core.estimation.model_order import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
+from omsm_ros.core.estimation.noise import scatter_in_time, uneven_rows
+from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated
+from omsm_ros.core.estimation.steps import Edge, Steps, segments
+from omsm_ros.core.model_errors.families import (
+    BACKLASH,
+    FASTEST_MODE_HZ,
+    FRICTION,
+    PERIODIC,
+    VIBRATION,
+    Departures,
+    Family,
+    Term,
+)
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.linear_algebra import unit_columns
+
+# Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
+_IMITATED = 1e-4
+# Directions this much weaker than the strongest are rounding.
+_SPANNED = 1e-9
+# That are in memory at a time beside the result.
+_SAMPLES = 65_536
+# Noise is averaged over at least this many lines: its level is then known to a quarter.
+_LEAST_LINES = 8
+# and over half an octave on either side where the lines are dense.
+_HALF_WIDTH = 2**0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What the residual says of one term.
+
+    size: its coefficients (c,), and covariance (c, c) of them
+    chi_square: of the hypothesis that they are zero;  degrees: coefficients that the fit does
+        not imitate
+    """
+
+    size: FloatArray
+    covariance: FloatArray
+    chi_square: float
+    degrees: int
+
+    @property
+    def log_p(self) -> float:
+        """Return ln of the probability of ``chi_square`` or more if the term is absent."""
+        return float(stats.chi2.logsf(self.chi_square, self.degrees)) if self.degrees else 0.0
+
+    @property
+    def uncertainty(self) -> float:
+        """Return the standard uncertainty of the first coefficient, infinite if unknown."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSpace:
+    """The residual of ``fitted`` and what its parameters can imitate."""
+
+    problem: Problem
+    fitted: Fit
+
+    @cached_property
+    def _basis(self) -> FloatArray:
+        return self._decomposed[0]
+
+    @cached_property
+    def _decomposed(self) -> tuple[FloatArray, FloatArray]:
+        """What the parameters can imitate: a basis (k, r), and its parameters (p, r)."""
+        unit, scale = unit_columns(self.problem.sensitivity(self.fitted))
+        left, values, right = np.linalg.svd(unit, full_matrices=False)
+        kept = values > _SPANNED * values[0]
+        return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
+
+    def imitating(self, column: FloatArray) -> FloatArray:
+        """Return the parameters (p,) that come nearest to ``column`` (n,) where it is compared."""
+        basis, parameters = self._decomposed
+        return np.asarray(parameters @ (basis.T @ column[self.problem.used]))
+
+    def _compared(self, columns: FloatArray) -> FloatArray:
+        """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
+        first, last = self._places[0], self._places[-1]
+        if last - first < len(self._places):
+            # Without a gap there is nothing to pick.
+            rows = columns.T[:, first : last + 1]
+            return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
+        return np.take(columns.T, self._places, axis=1).T
+
+    @cached_property
+    def _places(self) -> IntArray:
+        return np.flatnonzero(self.problem.used)
+
+    def freed(self, columns: FloatArray) -> FloatArray:
+        """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
+        rows = columns.T.copy()
+        self._free(rows)
+        return np.asarray(rows[:, self.problem.used].T)
+
+    def _free(self, rows: FloatArray) -> None:
+        """Take from ``rows`` (c, n) what is not compared, and what the fit can imitate."""
+        rows[:, ~self.problem.used] = 0.0
+        parts = [slice(i, i + _SAMPLES) for i in range(0, len(self._places), _SAMPLES)]
+        imitated = np.zeros((len(rows), self._basis.shape[1]))
+        for part in parts:
+            imitated += rows[:, self._places[part]] @ self._basis[part]
+        for part in parts:
+            rows[:, self._places[part]] -= imitated @ self._basis[part].T
+
+    def screen(self, columns: FloatArray, terms: int) -> FloatArray:
+        """Return χ² of each group of ``terms`` neighbouring columns of (n, c), as for white noise.
+
+        To find the best of many; :meth:`score` then judges it.
+        """
+        compared = self._compared(columns)
+        imitated = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
+        moment = (compared.T @ self.fitted.residual).reshape(-1, terms)
+        gram = np.empty((len(moment), terms, terms))
+        for i in range(terms):
+            for j in range(i + 1):
+                both = np.einsum("kg,kg->g", compared[:, i::terms], compared[:, j::terms])
+                both -= np.einsum("kg,kg->g", imitated[..., i], imitated[..., j])
+                gram[:, i, j] = gram[:, j, i] = both
+        inverse = np.linalg.pinv(gram, rcond=_IMITATED, hermitian=True)
+        explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)
+        return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
+
+    def score(self, columns: FloatArray) -> Score:
+        """Judge the term of ``columns`` (n, c), all its coefficients together."""
+        return self.judged(columns.T.copy())
+
+    def judged(self, rows: FloatArray) -> Score:
+        """Judge the term of ``rows`` (c, n), its columns, which are overwritten."""
+        rows[:, ~self.problem.used] = 0.0
+        before = _lengths(rows)
+        self._free(rows)
+        unit = _lengths(rows)
+        free = unit > _IMITATED * np.where(before > 0, before, 1.0)
+        terms = len(rows)
+        size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
+        if not np.any(free):
+            return Score(size, covariance, 0.0, 0)
+        rows, unit = rows[free] if not np.all(free) else rows, unit[free]
+        rows /= unit[:, np.newaxis]
+        inverse, degrees = _pseudo_inverse(rows @ rows.T, _IMITATED**2)
+        found = inverse @ (rows @ self._residual)
+        spread = inverse @ self._noise_of(rows, found) @ inverse.T
+        chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
+        size[free] = found / unit
+        covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
+        return Score(size, covariance, chi_square, degrees)
+
+    @cached_property
+    def _residual(self) -> FloatArray:
+        return self.problem.on_grid(self.fitted.residual, 0.0)
+
+    def _noise_of(self, rows: FloatArray, found: FloatArray) -> FloatArray:
+        """Return the covariance (c, c) of noise times ``rows`` (c, n).
+
+        The noise is like what ``rows``, ``found`` (c,) times, leave of the residual.
+        """
+        used = self.problem.used
+        samples = len(used)
+        length = fft.next_fast_len(samples, real=True)
+        residual = (self._residual - found @ rows)[used]
+        noise = broad_noise(residual, self._places, samples, length)
+        noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
+        even = weighted_gram(rows, length, noise)
+        if self._scatter == 0 and self.problem.shared == 0:
+            return even
+        uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
+        return np.asarray(even + uneven.T @ uneven)
+
+    @cached_property
+    def _scatter(self) -> float:
+        return scatter_in_time(self.problem, self.fitted.residual)
+
+
+def _lengths(rows: FloatArray) -> FloatArray:
+    """Return the lengths (c,) of ``rows`` (c, n); numpy's norm takes their memory again."""
+    return np.asarray(np.sqrt(np.einsum("cn,cn->c", rows, rows)))
+
+
+def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:
+    """Return the inverse (c, c) of ``gram`` where it is not zero, and in how many directions."""
+    values, directions = np.linalg.eigh(gram)
+    kept = values > tolerance * values[-1]
+    strong = directions[:, kept]
+    return np.asarray(strong / values[kept] @ strong.T), int(np.sum(kept))
+
+
+def broad_noise(residual: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
+    """Return the variance spectrum of ``residual`` (k,) at ``length`` // 2 + 1 frequencies.
+
+    place: index of each among ``samples``
+    The larger of an autoregressive one, which misses slow drift, and of the periodogram
+    smoothed over an octave, which does not.
+    """
+    on_grid = np.zeros(samples)
+    on_grid[place] = residual
+    power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(residual)
+    line = np.arange(len(power))
+    low = np.minimum(line / _HALF_WIDTH, line - _LEAST_LINES / 2).astype(int)
+    low = np.clip(low, 1, max(len(power) - _LEAST_LINES, 1))
+    high = np.maximum(line * _HALF_WIDTH, low + _LEAST_LINES).astype(int)
+    high = np.minimum(high, len(power))
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    smooth = (total[high] - total[low]) / np.maximum(high - low, 1)
+    return np.asarray(np.maximum(smooth, noise_spectrum(residual, length)))
+
+
+# Which departures from a linear, steady G(s) does the residual of one fit show?
+
+# Probability of a false alarm of one family; ten of them together stay far below two per cent.
+FALSE_ALARM = 1e-4
+# Of the rate of the motion, as the residual may follow it.
+_LAGS = 25
+# A lagged rate weaker than this part of the strongest is rounding.
+_ABOVE_ROUNDING = 1e-6
+# Rows, and values of columns, that are in memory at a time.
+_ROWS, _VALUES = 65_536, 8_000_000
+# A step test rests for most of its time.
+_MOSTLY = 0.5
+# Where a motion turns and what a line is, fewer samples do not tell as well; their terms are few.
+_BY_ALL = (VIBRATION, BACKLASH, FRICTION)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A term and what the residual says of it."""
+
+    term: Term
+    score: Score
+
+    @property
+    def log_p(self) -> float:
+        """Natural logarithm of the probability of such a score anywhere in its family."""
+        return self.score.log_p + float(np.log(self.term.trials))
+
+    def evidence(self, samples: int) -> float:
+        """Return ln of the odds for this term (Schwarz 1978), its coefficients priced."""
+        return 0.5 * (self.score.chi_square - self.score.degrees * float(np.log(samples)))
+
+    @property
+    def significant(self) -> bool:
+        """Return whether chance is less likely than FALSE_ALARM."""
+        return bool(self.log_p < np.log(FALSE_ALARM))
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """The scores for ``fitted`` of all families, or of those named; each is computed once.
+
+    slower: see :class:`Departures`
+    """
+
+    problem: Problem
+    fitted: Fit
+    steps: Steps
+    only: Collection[str] = ()
+    slower: float = 1.0
+
+    @cached_property
+    def space(self) -> ResidualSpace:
+        """The residual, and what the fit imitates."""
+        return ResidualSpace(self.problem, self.fitted)
+
+    @cached_property
+    def departures(self) -> Departures:
+        """The columns of all families."""
+        return Departures(self.problem, self.fitted, self.steps, self.slower)
+
+    @cached_property
+    def best(self) -> Mapping[str, Judged]:
+        """Return the most significant term of each family, by the name of the family."""
+        found: dict[str, Judged] = {}
+        for family in self.departures.families(self.only):
+            term = self._best_of(family)
+            if family.name == PERIODIC:
+                term = self._best_of(self.departures.periodic(term.parameter))
+            judged, before = Judged(term, self.space.score(term.columns)), found.get(family.name)
+            if before is None or self.evidence(judged) > self.evidence(before):
+                found[family.name] = judged
+        return found
+
+    def _best_of(self, family: Family) -> Term:
+        if len(family.parameters) == 1:
+            return family.term(0)
+        if self.thinned is None or family.name in _BY_ALL:
+            return family.term(int(np.argmax(self.screened(family))))
+        alike = self.thinned.departures.alike(family)
+        return family.term(int(np.argmax(self.thinned.screened(alike))))
+
+    def screened(self, family: Family) -> FloatArray:
+        """Return χ² of each term of ``family``, as for white noise, see :class:`ResidualSpace`."""
+        every = len(family.parameters)
+        step = max(_VALUES // (len(self.problem.input) * family.width), 1)
+        return np.concatenate(
+            [
+                self.space.screen(family.part(i, min(i + step, every)), family.width)
+                for i in range(0, every, step)
+            ]
+        )
+
+    @cached_property
+    def thinned(self) -> Survey | None:
+        """The same of fewer samples, of a long step test: what is slow shows there as well.
+
+        None where there are few samples, where the motion hardly rests, so that much of it may be
+        fast, or where rounding is shared by the readings of a plateau.
+        """
+        problem, steps = self.problem, self.steps
+        fastest = max(problem.rate / (2 * np.pi), FASTEST_MODE_HZ)
+        per_content = 0.5 / (problem.period * fastest * ABOVE_CONTENT)
+        every = int(min(len(problem.input) / ENOUGH_SAMPLES, per_content))
+        rests = bool(steps.edges) and float(np.mean(steps.moving)) < _MOSTLY
+        if every < 2 or not rests or problem.shared > 0:
+            return None
+        fewer = coarser(problem, every)
+        fitted = evaluated(fewer, self.fitted.structure, self.fitted.nonlinear)
+        edges = tuple(
+            Edge(edge.start // every, -(-edge.stop // every), edge.height) for edge in steps.edges
+        )
+        moved = replace(steps, edges=edges, moving=steps.moving[::every])
+        return replace(self, problem=fewer, fitted=fitted, steps=moved)
+
+    @cached_property
+    def creep(self) -> tuple[Judged, ...]:
+        """Return relaxations of every time constant that is looked for, each judged alone."""
+        family = self.departures.creep()
+        terms = (family.term(index) for index in range(len(family.parameters)))
+        return tuple(Judged(t, self.space.score(t.columns[:, :1])) for t in terms)
+
+    @cached_property
+    def independence(self) -> float:
+        """Return the probability that the residual follows the motion's rate by chance."""
+        rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.input)])
+        # The last values of the rate, the newest last; at the very first samples there are none.
+        past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
+        gram = np.zeros((_LAGS, _LAGS))
+        for first in range(0, len(past), _ROWS):
+            rows = np.ascontiguousarray(past[first : first + _ROWS])
+            gram += rows.T @ rows
+        powers, directions = np.linalg.eigh(gram)
+        kept = powers > _ABOVE_ROUNDING**2 * powers[-1]
+        if not np.any(kept):
+            return 1.0
+        mixed = directions[:, kept] / np.sqrt(powers[kept])
+        columns = np.empty((mixed.shape[1], len(past)))
+        for first in range(0, len(past), _ROWS):
+            columns[:, first : first + _ROWS] = (past[first : first + _ROWS] @ mixed).T
+        return float(np.exp(self.space.judged(columns).log_p))
+
+    def significant(self, but: Collection[str] = ()) -> list[Judged]:
+        """Return the significant families, the clearest first, without those named ``but``."""
+        shown = [j for j in self.best.values() if j.term.family not in but and j.significant]
+        return sorted(shown, key=self.evidence, reverse=True)
+
+    def evidence(self, judged: Judged) -> float:
+        """Return the logarithm of the odds for ``judged``."""
+        return judged.evidence(self.fitted.samples)
+
+    @property
+    def slowest_creep(self) -> float:
+        """Return the longest time constant [s] that was looked for."""
+        return float(self.departures.time_constants()[-1])
+
+    @property
+    def plateau(self) -> float:
+        """Time from one edge to the next [s]; of a motion without edges its whole length."""
+        starts = [edge.start for edge in self.steps.edges]
+        if len(starts) < 2:
+            return self.departures.duration
+        return float(np.median(np.diff(starts))) * self.problem.period
+
+
+# Do the parts of one step test agree? Steps up and down, small and large, early and late.
+#
+# A linear, steady response has one lag and one gain. Each contrast lets them differ between two
+# parts of the test by ``±d`` and asks what the residual says of d.
+
+UP_DOWN = "steps up against steps down"
+HALVES = "first half against second"
+SIZES = "small steps against large"
+# Two of a kind show how far they scatter.
+_LEAST_EDGES = 4
+# Of heights that are meant to be different.
+_TWO_SIZES = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """What differs between two parts of a test, the first one less the second.
+
+    parts: their names;  gain: relative [1], lag: [s], each with standard uncertainty
+    p: probability of such differences by chance
+    """
+
+    parts: str
+    gain: float
+    gain_uncertainty: float
+    lag: float
+    lag_uncertainty: float
+    p: float
+
+    @property
+    def significant(self) -> bool:
+        """Return whether chance is less likely than FALSE_ALARM."""
+        return self.p < FALSE_ALARM
+
+
+def contrasts(survey: Survey) -> list[Contrast]:
+    """Return the contrasts that the steps of this test allow."""
+    samples = len(survey.problem.input)
+    return [_of(survey, name, weight) for name, weight in _weights(survey.steps, samples)]
+
+
+def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
+    """Yield 1 in the first part and -1 in the second, (n,), for each pair of parts."""
+    if len(steps.edges) < _LEAST_EDGES:
+        return
+    heights = np.array([edge.height for edge in steps.edges])
+    length = np.array([stop - start for start, stop in segments(steps, samples, _LEAST_EDGES)])
+    sizes = np.abs(heights)
+    up, early = heights > 0, np.arange(len(heights)) < len(heights) / 2
+    split = {UP_DOWN: up}
+    if not (np.array_equal(up, early) or np.array_equal(up, ~early)):
+        split[HALVES] = early
+    if np.max(sizes) > _TWO_SIZES * np.min(sizes):
+        split[SIZES] = sizes < np.sqrt(np.max(sizes) * np.min(sizes))
+    for name, first in split.items():
+        if 0 < np.sum(first) < len(first):
+            yield name, np.repeat(np.where(first, 1.0, -1.0), length)
+
+
+def _of(survey: Survey, name: str, weight: FloatArray) -> Contrast:
+    fitted, problem = survey.fitted, survey.problem
+    answer = fitted.gain * problem.response(fitted)
+    by_gain = np.cumsum(weight * np.diff(answer, prepend=answer[0]))
+    by_lag = -weight * np.gradient(answer, problem.period)
+    score = survey.space.score(np.column_stack([by_gain, by_lag]))
+    gain, lag = 2 * score.size
+    gain_uncertainty, lag_uncertainty = 2 * np.sqrt(np.diag(score.covariance))
+    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, _chance(score))
+
+
+def _chance(score: Score) -> float:
+    return float(np.exp(score.log_p))

@@ -1,0 +1,397 @@
+"""How large could a departure be that a residual does not show, and what would it do to G?
+
+A slow relaxation of size ε leaves G(0) = 1 and scales everything faster by 1 - ε, a little late.
+That changes the whole numerator and the delay; below ``valid_from`` the gain is one again. A mode
+or a stiffness that is left out is imitated by the fitted coefficients, which shifts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import stats
+
+from omsm_ros.core.estimation.model_order import MAX_POLES
+from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.output_error import Fit, Problem, fit
+from omsm_ros.core.lti.frequency_response import relative_response_jacobian, response_band
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.model_errors.families import CREEP, FASTEST_CREEP_S, MODE, STIFFENING, Term
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Judged, Survey
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.linear_algebra import least_squares
+
+# Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
+# area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
+PAPER_SCAN = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
+# Of its rate [m/s], rms.
+_SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SCAN)))
+# A test that alarms with probability α misses with 5 % what lies 1.645 σ above its limit.
+_POWER = 1.645
+# The families whose omission bends the response itself.
+_BENDING = (MODE, STIFFENING)
+HIDING = (CREEP, *_BENDING)
+"""Every family that may hide in a test, by which priors are named."""
+
+# Decades of time between a structure's slowest motion and the length of a record.
+_DECADES = 3.0
+# What creeps within the record creeps on beyond it, about as much in each of three decades from
+# none to all: a uniform distribution, whose standard deviation is 1/√3 of its end.
+_UNSEEN = _DECADES / 3**0.5
+# A joint or a piezo goes on creeping for a minute, whatever a record lasts; what is slower moves
+# by less in a scan. Of what is slower than ten records not even its beginning shows. A drift of
+# 100 nm a minute may be a relaxation of 50 s and 0.17 %; of 100 s, it would be twice that, and a
+# warm machine could not be calibrated.
+_SLOWEST_CREEP_S, _MOST_RECORDS = 50.0, 10.0
+# Probability by chance below which a mode is carried that is not significant.
+_HINT = 0.05
+# Of the background: the drift that every fit has.
+_STEADY_DRIFT = slice(1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTerm:
+    """One family that could hide.
+
+    size, uncertainty: of the most significant term of the family, in its unit
+    missed: largest size that the test would have missed with 5 % probability; inf where it
+        shows none
+    shift: (p,) of the coefficients per unit, if the term is left out
+    gain, late: (p,) change of the coefficients that scales the whole response by one, and that
+        delays it by a second
+    above: relative error of the gain at all frequencies above ``valid_from``, per unit
+    lag: that costs a scan as much as what the response is late by [s], per unit
+    effect: rms error on the paper's scan per unit [m]
+    """
+
+    family: str
+    parameter: float
+    size: float
+    uncertainty: float
+    missed: float
+    shift: FloatArray
+    gain: FloatArray
+    late: FloatArray
+    above: float
+    lag: float
+    effect: float
+
+    @property
+    def carried(self) -> float:
+        """Standard uncertainty of the size that is left out."""
+        return float(np.hypot(self.size, self.uncertainty))
+
+    def covariance(self, carried: float) -> FloatArray:
+        """Return the coefficients' covariance (p, p) for a size known to ``carried``."""
+        rows = carried * np.stack([self.shift, self.above * self.gain, self.lag * self.late])
+        return np.asarray(rows.T @ rows)
+
+
+def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm]:
+    """Return what could hide: the worst relaxation first, then the families that bend G.
+
+    drift: columns of the background that model a drift
+    """
+    # Of relaxations alone: what the survey found of all else stands.
+    slow = with_slower_creep(survey.thinned or survey)
+    relaxations = [_hidden(slow, judged) for judged in slow.creep]
+    for gone in _taken_for_noise(drift):
+        other = without_drift(slow, gone).creep
+        relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
+    known = [term for term in relaxations if np.isfinite(term.uncertainty)]
+    found = _worst(known, relaxation_found(survey.fitted.dynamics)) if known else []
+    for name in _BENDING:
+        judged = survey.best.get(name)
+        if judged is None or not np.isfinite(judged.score.uncertainty):
+            continue
+        if _excited(survey, judged) or _hinted(judged):
+            found.append(_hidden(survey, judged))
+    return found
+
+
+def _taken_for_noise(drift: Sequence[slice]) -> list[Sequence[slice]]:
+    """Return which drifts to take for noise: the steady one, the bent one, and both."""
+    steady = [_STEADY_DRIFT]
+    return [steady, drift, [*steady, *drift]] if drift else [steady]
+
+
+def with_slower_creep(survey: Survey) -> Survey:
+    """Return ``survey`` with relaxations of a minute, or as slow as this record is long."""
+    slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / survey.departures.duration)
+    return replace(survey, slower=max(slower, 1.0))
+
+
+def without_drift(survey: Survey, drift: Sequence[slice]) -> Survey:
+    """Return ``survey`` with the drift that was modelled taken for noise of the readings.
+
+    Columns of any size let a drift of a micrometre undo a relaxation of as much. One that
+    wanders by nanometres cannot, and as noise it is no larger than it was found to be. A slow
+    relaxation itself looks like a steady drift: where there is none, there is no relaxation.
+    """
+    fitted, problem = survey.fitted, survey.problem
+    gone = np.zeros(problem.background.shape[1], np.bool_)
+    for columns in drift:
+        gone[columns] = True
+    drifted = problem.background[:, gone] @ fitted.background[gone]
+    noisy = fitted.residual + drifted[problem.used]
+    return Survey(
+        replace(problem, background=problem.background[:, ~gone]),
+        replace(fitted, background=fitted.background[~gone], residual=noisy),
+        survey.steps,
+        slower=survey.slower,
+    )
+
+
+def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
+    """Return the relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
+    size, uncertainty = float(other.score.size[0]), other.score.uncertainty
+    if not np.hypot(size, uncertainty) < term.carried:
+        return term
+    # The alarm is that of the fit, which lets the drift be as large as it likes.
+    return replace(term, size=size, uncertainty=uncertainty)
+
+
+def _worst(relaxations: list[HiddenTerm], found: float) -> list[HiddenTerm]:
+    """Return the relaxation that would cost most, and of another one the lag if that is larger.
+
+    Neither is larger than is likely where one was found.
+
+    found: size of what is in the model already. Creep of joints and of piezos goes about
+    evenly with the logarithm of time; what lies in the other decades of the record is not
+    more than a few times what was found, and a larger one only the model's own imitates.
+    """
+    if found > 0:
+        limit = _DECADES * found
+        relaxations = [
+            replace(term, size=min(term.size, limit), uncertainty=min(term.uncertainty, limit))
+            for term in relaxations
+        ]
+    worst = max(relaxations, key=lambda term: term.effect * term.carried)
+    slower = _UNSEEN * found
+    latest = max((_by_excess(term) for term in relaxations), key=lambda term: term.lag * term.size)
+    other = [latest] if latest.lag * latest.size > worst.lag * worst.carried else []
+    if worst.above > 0 and worst.carried * worst.above < slower:
+        worst = replace(worst, size=0.0, uncertainty=slower / worst.above)
+    return [worst, *other]
+
+
+def _by_excess(term: HiddenTerm) -> HiddenTerm:
+    """Return the lag alone of ``term``, in the size by which it exceeds what noise makes of none.
+
+    Many relaxations lag, of each of which the noise would hide some; those that the data hint at
+    are carried.
+    """
+    excess = float(np.sqrt(max(term.size**2 - term.uncertainty**2, 0.0)))
+    effect = term.lag * _SCAN_RATE
+    return replace(term, size=excess, uncertainty=0.0, above=0.0, effect=effect)
+
+
+def relaxation_found(dynamics: TransferFunction) -> float:
+    """Return the share of G(0) that comes with real poles slower than a structure's [1]."""
+    poles = dynamics.poles()
+    found = 0.0
+    for index, pole in enumerate(poles):
+        if pole.imag == 0 and -pole.real * FASTEST_CREEP_S < 1:
+            others = np.delete(poles, index)
+            share = polynomial.polyval(pole, dynamics.numerator) / np.prod(1 - pole / others)
+            found += abs(float(np.real(share)))
+    return found
+
+
+def _excited(survey: Survey, judged: Judged) -> bool:
+    """Return False for a mode slower than the steps follow each other: they hardly excite it."""
+    return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
+
+
+def _hinted(judged: Judged) -> bool:
+    """Return whether chance alone makes such a mode in one test of twenty, or in fewer."""
+    return judged.term.family == MODE and judged.log_p < np.log(_HINT)
+
+
+def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
+    fitted, term, score = survey.fitted, judged.term, judged.score
+    shift = omitted(survey, term.columns[:, 0])
+    frequency, rms = np.array(PAPER_SCAN).T
+    imitated = _relative(fitted, frequency, shift)
+    remaining = imitated - _departure(term.family, term.parameter, term.damping, frequency)
+    # A light mode is tenfold at its own frequency, which no fitted coefficient imitates.
+    whole = term.family == CREEP or _hinted(judged)
+    gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
+    lag = float(np.linalg.norm(remaining.imag * rms)) / _SCAN_RATE
+    return HiddenTerm(
+        term.family,
+        term.parameter,
+        float(score.size[0]),
+        score.uncertainty,
+        _missed(judged),
+        np.zeros_like(shift) if whole else shift,
+        gain,
+        np.eye(len(gain))[-1],
+        float(np.max(np.abs(remaining if term.family == MODE else remaining.real))) * whole,
+        lag * whole,
+        float(np.sqrt(np.sum((np.abs(remaining) * rms) ** 2))),
+    )
+
+
+def _missed(judged: Judged) -> float:
+    """Return the largest size that the test would have missed with 5 % probability."""
+    degrees = max(judged.score.degrees, 1)
+    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, degrees))
+    return float(limit + _POWER) * judged.score.uncertainty
+
+
+def _departure(family: str, parameter: float, damping: float, frequency: FloatArray) -> FloatArray:
+    """Return the complex departure of G, relative, at ``frequency`` (k,) [Hz], per unit, (k,)."""
+    s = 2j * np.pi * frequency
+    if family == CREEP:
+        return np.asarray(-s * parameter / (1 + s * parameter))
+    if family == MODE:
+        s = s / (2 * np.pi * parameter)
+        return np.asarray(1 / (1 + 2 * damping * s + s * s) - 1)
+    return np.zeros(len(frequency), np.complex128)
+
+
+def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArray:
+    real, imaginary = relative_response_jacobian(fitted.dynamics, frequency) @ shift
+    return np.asarray(real + 1j * imaginary)
+
+
+def omitted(survey: Survey, column: FloatArray) -> FloatArray:
+    """Return the shift (p,) of G's coefficients if a term that adds ``column`` (n,) is omitted."""
+    fitted, solved = survey.fitted, survey.space.imitating(column)
+    jacobian = fitted.scaled.coefficient_jacobian(fitted.nonlinear)
+    return np.asarray(jacobian @ solved[: fitted.structure.size])
+
+
+# How else could a light mode that became a pole look, and describe the record about as well?
+#
+# Steps that follow each other evenly excite a comb of frequencies. A light mode between its teeth
+# shows at the teeth beside it only, so that several frequencies and dampings explain the residual
+# about equally well. The covariance at one of them knows nothing of the others: their spread,
+# weighted by likelihood, comes on top.
+
+# Of the frequency found, as a logarithm; and the dampings, a factor of two apart.
+_FREQUENCIES = np.linspace(-0.4, 0.4, 33)
+_DAMPINGS = (0.01, 0.02, 0.04, 0.08, 0.16)
+# Less likely than this against the best, they add nothing that matters.
+_LEAST_LIKELY = 1e-3
+# Where responses are compared, a few per cent apart.
+_LINES = 150
+_LOWEST_HZ = 0.1
+# Times the mode's frequency; far above it nothing depends on which mode it is.
+_HIGHEST = 10.0
+# Of the largest variation: less is all alike.
+_LITTLE = 0.02
+# Directions of the coefficients weaker than this change no response by what matters.
+_DIRECTIONS = 1e-6
+
+
+def spread_of_modes(before: Survey, term: Term, fitted: Fit) -> FloatArray:
+    """Return the covariance (p, p) of what other light modes than ``term`` would make of G.
+
+    before: survey of the fit without the mode;  term: the mode as ``fitted`` has it
+    """
+    highest = 0.25 / before.problem.period
+    tried: list[tuple[float, float]] = [(term.parameter, term.damping)]
+    tried += [
+        (term.parameter * float(np.exp(off)), damping)
+        for damping in _DAMPINGS
+        for off in _FREQUENCIES
+        if term.parameter * np.exp(off) < highest
+    ]
+    before = before.thinned or before
+    modes = before.departures.modes(tried)
+    screened = before.screened(modes)
+    likely = np.exp(0.5 * (screened - np.max(screened)))
+    kept = np.flatnonzero(likely > _LEAST_LIKELY)
+    lines = np.geomspace(_LOWEST_HZ, _HIGHEST * term.parameter, _LINES)
+    lines = np.sort(np.append(lines, [frequency for frequency, _ in tried]))
+    own = _change(before, modes.term(0), lines)
+    rows = [
+        np.sqrt(likely[i] / np.sum(likely[kept])) * (_change(before, modes.term(i), lines) - own)
+        for i in kept.tolist()
+    ]
+    return _imitating(fitted, lines, np.asarray(rows))
+
+
+def _imitating(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray:
+    """Return the covariance (p, p) with which G varies at ``lines`` (k,) as by ``rows`` (m, k).
+
+    Coefficients turn one mode into its neighbours, not into all of them: where ``rows`` are large
+    the covariance is as large at least.
+    """
+    wanted = np.linalg.norm(rows, axis=0)
+    # Where little varies, as little may come of it.
+    weight = 1 / np.maximum(wanted, _LITTLE * np.max(wanted)) if np.any(wanted) else wanted
+    jacobian = np.concatenate(
+        weight[:, np.newaxis] * relative_response_jacobian(fitted.dynamics, lines)
+    )
+    shifts = np.column_stack(
+        [
+            least_squares(jacobian, np.concatenate([r.real, r.imag]), _DIRECTIONS)
+            for r in weight * rows
+        ]
+    )
+    covariance = np.asarray(shifts @ shifts.T)
+    band = response_band(fitted.dynamics, covariance, lines)
+    held = np.hypot(band.gain, band.phase)
+    large = (wanted > 0.5 * np.max(wanted)) & (held > 0)
+    factor = max(1.0, float(np.max(wanted[large] / held[large], initial=1.0)))
+    return np.asarray(factor**2 * covariance)
+
+
+def _change(before: Survey, term: Term, lines: FloatArray) -> ComplexArray:
+    """Return the relative change (k,) of G at ``lines`` [Hz] by a mode in its best size."""
+    size = before.space.score(term.columns).size
+    ratio = 1j * lines / term.parameter
+    mode = 1 / (1 + 2 * term.damping * ratio + ratio**2)
+    real, imaginary = relative_response_jacobian(before.fitted.dynamics, lines) @ omitted(
+        before, term.columns @ size
+    )
+    return np.asarray(size[0] * (mode - 1) + size[1] * ratio * mode - real - 1j * imaginary)
+
+
+# A relaxation, or a light mode, as poles of a response.
+
+
+def poles_of(term: Term) -> ComplexArray:
+    """Return the poles [rad/s] of a relaxation, (1,), or of a mode, (2,)."""
+    if term.family == CREEP:
+        return np.array([-1 / term.parameter], np.complex128)
+    omega = 2 * np.pi * term.parameter
+    upper = omega * (-term.damping + 1j * np.sqrt(1 - term.damping**2))
+    return np.array([upper, np.conj(upper)], np.complex128)
+
+
+def as_fitted(term: Term, fitted: Fit) -> Term:
+    """Return ``term`` with the time constant [s] or frequency [Hz] of the pole that it became."""
+    poles = fitted.dynamics.poles()
+    near = np.abs(np.log(poles / poles_of(term)[0]))
+    pole = poles[int(np.argmin(near))]
+    parameter = 1 / abs(pole) if term.family == CREEP else abs(pole) / (2 * np.pi)
+    return replace(term, parameter=float(parameter), damping=float(-pole.real / abs(pole)))
+
+
+def with_poles(
+    problem: Problem, base: Fit, new: ComplexArray, starts: Sequence[float]
+) -> Fit | None:
+    """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them.
+
+    None where they would be more than can be fitted.
+    """
+    zeros, delay = base.structure.zeros + len(new), base.structure.delay
+    larger = Structure(base.structure.poles + len(new), zeros, delay)
+    if larger.poles > MAX_POLES:
+        return None
+    scaled = Scaled(larger, problem.rate)
+    late = float(base.nonlinear[-1]) if delay else 0.0
+    own = base.dynamics.poles()
+
+    def started(faster: float) -> FloatArray:
+        poles = np.concatenate([own, faster * new]) / problem.rate
+        return scaled.nonlinear_of(np.asarray(poles, np.complex128), late)
+
+    return fit(problem, larger, [started(faster) for faster in starts])

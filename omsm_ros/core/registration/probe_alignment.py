@@ -1,0 +1,317 @@
+"""Where does the probe pass the spindle axis, and how does its beam lean?
+
+From a scan of a reference sphere. A probe that passes the axis at a distance measures a
+sphere as something else: off by e along the feed it sees a cusp or a dimple at the centre,
+off across the feed a flattened one. A beam that leans by β over the distance d looks d β
+aside. Both are found by fitting the sphere to the points that the corrector would deliver
+with the corrected geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize
+
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
+from omsm_ros.core.streams.blocks import AxisBlock, FloatArray
+from omsm_ros.core.streams.statistics import EvenSelection, noise_of
+from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.linear_algebra import least_squares, unit_columns
+from omsm_ros.readable import measured, quantity
+from omsm_ros.units import MICROMETRE_M
+
+_OfUnknown = Callable[[FloatArray], FloatArray]
+_COLUMNS = ("x", "y", "z", "b", "c", "distance")
+# Ten groups of consecutive points, whose scatter is then known to a quarter.
+_MIN_POINTS = 1000
+# Thinned evenly to so many: time and memory of the fit stay bounded.
+_MAX_POINTS = 60_000
+# Consecutive points within which residuals may be correlated: 0.1 s at 1 kHz.
+_GROUP_POINTS = 100
+# Unknowns are fitted in these units: micrometres for lengths, milliradians for slopes.
+_SLOPE_UNIT = 1e-3
+# A certified radius is known to better; one that is off by more is another's, or a slip of the pen.
+_RADIUS_KNOWN = 2e-4
+# No five standard deviations are chance.
+_CERTAIN = 5.0
+# With less than this a slope of the beam moves no point by a nanometre.
+_USEFUL_DISTANCE_M = 2e-6
+# Singular values below this part of the largest are rounding.
+_SINGULAR = 1e-13
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SphereScan:
+    """A scan of a sphere before kinematics, each array (n,).
+
+    x, y: slides [m];  z: H(z) [m];  b, c: [rad];  distance: true, growing with height [m]
+    """
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+    distance: FloatArray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Geometry found, and how well.
+
+    uncertainty: standard uncertainties of centre_x, centre_y [m], beam_x, beam_y [1]
+    sphere: centre in the workpiece frame and radius [m]; convex if its centre lies below
+    residual: rms left [m];  scatter: of a point about its neighbours [m], what noise alone leaves
+    beam_found: False where the distance hardly varied
+    used: points fitted
+    """
+
+    geometry: Geometry
+    uncertainty: tuple[float, float, float, float]
+    sphere: tuple[float, float, float, float]
+    residual: float
+    scatter: float
+    beam_found: bool
+    used: int
+
+
+class SphereScanReader:
+    """The scan behind corrected points that come in portions, in bounded memory.
+
+    points: how many came; of them no more than are fitted are kept, evenly chosen
+    """
+
+    def __init__(self) -> None:
+        self.points = 0
+        self._axes: list[AxisBlock] = []
+        self._kept = EvenSelection(_MAX_POINTS)
+
+    def add_axes(self, block: AxisBlock) -> None:
+        """Take in the next axis block, before the points that come of it."""
+        self._axes.append(block)
+
+    def add(self, points: SurfacePoints) -> None:
+        """Take in the next points, corrected with no geometry and no lateral lag."""
+        if not len(points):
+            return
+        scan = sphere_scan_of(points, self._axes)
+        self._kept.add(np.stack([getattr(scan, name) for name in _COLUMNS], axis=1))
+        self.points += len(points)
+        last = points.sample[-1]
+        self._axes = [b for b in self._axes if b.end > last]
+
+    def scan(self) -> SphereScan:
+        """Return the points kept."""
+        rows = self._kept.rows().reshape(-1, len(_COLUMNS))
+        return SphereScan(**dict(zip(_COLUMNS, rows.T, strict=True)))
+
+
+def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
+    """Return the scan behind points that were corrected with no geometry and no lateral lag.
+
+    axes: the blocks of that one scan. Raises DataError for a point that is in none of them.
+    """
+    counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in axes])
+    order = np.argsort(counts, kind="stable")
+    index = np.minimum(np.searchsorted(counts, points.sample, sorter=order), len(counts) - 1)
+    place = order[index]
+    strange = np.flatnonzero(counts[place] != points.sample)
+    if len(strange):
+        raise DataError(
+            f"sample {int(points.sample[strange[0]])!r} is in none of the axis blocks; "
+            "give the blocks of the scan that was corrected"
+        )
+    x, y, z, b, c = (
+        np.concatenate([getattr(block, name) for block in axes])[place] for name in "xyzbc"
+    )
+    moved = z - points.dynamic_error
+    return SphereScan(x=x, y=y, z=moved, b=b, c=c, distance=(points.height - moved) / np.cos(b))
+
+
+def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None = None) -> Alignment:
+    """Fit spindle centre and lean of the beam to a scan of a sphere.
+
+    radius: of the sphere [m], certified; negative for a convex one
+    geometry: what is known already: the probe's place; its centre and beam are the start
+
+    Raises DataError for a scan that is too short, does not look like a sphere, or looks like one of
+    another radius.
+    """
+    scan = _thinned(scan)
+    start = geometry or Geometry()
+    beam = bool(np.ptp(scan.distance) > _USEFUL_DISTANCE_M)
+    first = _first_guess(scan, radius, start, beam)
+    free = _fitted(
+        radius,
+        lambda u: _misfit(scan, u[-1] * MICROMETRE_M, start, u[:-1]),
+        lambda u: np.c_[_jacobian(scan, start, u[:-1]), np.full(len(scan.z), -np.sign(radius))],
+        np.append(first, radius / MICROMETRE_M),
+    )
+    known = _checked_radius(free, radius)
+    found = _fitted(
+        radius,
+        lambda u: _misfit(scan, radius, start, u),
+        lambda u: _jacobian(scan, start, u),
+        first,
+    )
+    residual = _rms(found)
+    deviations = _standard_uncertainties(found.jac, found.fun)
+    if not known:
+        # By what a radius that is hardly right moves them.
+        deviations = np.hypot(deviations, found.x - free.x[:-1])
+    aligned = _with(start, found.x)
+    in_si = np.append(deviations[:2] * MICROMETRE_M, (deviations[5:] * _SLOPE_UNIT))
+    lean = in_si[2:] if beam else (np.inf, np.inf)
+    sphere = tuple(float(v) * MICROMETRE_M for v in found.x[2:5])
+    return Alignment(
+        geometry=aligned,
+        uncertainty=(float(in_si[0]), float(in_si[1]), float(lean[0]), float(lean[1])),
+        sphere=(sphere[0], sphere[1], sphere[2], radius),
+        residual=residual,
+        scatter=noise_of(found.fun) * MICROMETRE_M,
+        beam_found=beam,
+        used=len(scan.z),
+    )
+
+
+def _fitted(
+    radius: float, misfit: _OfUnknown, jacobian: _OfUnknown, first: FloatArray
+) -> optimize.OptimizeResult:
+    left = "its centre strays out of the machine"
+    try:
+        found = optimize.least_squares(misfit, first, jac=jacobian, method="lm", x_scale="jac")
+    except ConfigurationError:  # no geometry has it there
+        pass
+    else:
+        if found.success and _rms(found) <= 0.01 * abs(radius):
+            return found
+        left = f"{quantity(_rms(found), 'm')} rms are left"
+    raise DataError(
+        f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: {left}; "
+        "check the radius and its sign, and that the scan covers the sphere"
+    )
+
+
+def _rms(found: optimize.OptimizeResult) -> float:
+    """Return the rms distance of the points from the sphere [m]."""
+    return float(np.sqrt(np.mean(found.fun**2)) * MICROMETRE_M)
+
+
+def _checked_radius(free: optimize.OptimizeResult, radius: float) -> bool:
+    """Return whether the radius that fits best, last of what is found, is the one that is given.
+
+    Raises DataError where it is so far off that the centre found would be no centre.
+    """
+    fits = float(free.x[-1]) * MICROMETRE_M
+    spread = float(_standard_uncertainties(free.jac, free.fun)[-1]) * MICROMETRE_M
+    off = abs(fits - radius)
+    if off > max(_CERTAIN * spread, _RADIUS_KNOWN * abs(radius)):
+        raise DataError(
+            f"the scan is of a sphere of radius {measured(fits, spread, 'm')} (k = 1), not "
+            f"{quantity(radius, 'm', 6)}; check the radius, or the scale of Z"
+        )
+    return off <= 2 * spread
+
+
+def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:
+    centred = replace(
+        geometry,
+        centre_x=float(unknown[0]) * MICROMETRE_M,
+        centre_y=float(unknown[1]) * MICROMETRE_M,
+    )
+    if len(unknown) == 5:
+        return centred
+    return replace(
+        centred,
+        beam_x=float(unknown[5]) * _SLOPE_UNIT,
+        beam_y=float(unknown[6]) * _SLOPE_UNIT,
+    )
+
+
+def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatArray) -> FloatArray:
+    """Return the distances of the points from the sphere [µm], (n,)."""
+    points = workpiece_points(
+        _with(geometry, unknown), (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance
+    )
+    centre = unknown[2:5] * MICROMETRE_M
+    away = np.sqrt(
+        (points.x - centre[0]) ** 2 + (points.y - centre[1]) ** 2 + (points.height - centre[2]) ** 2
+    )
+    return np.asarray((away - abs(radius)) / MICROMETRE_M, np.float64)
+
+
+def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
+    """Return the derivatives of :func:`_misfit` (n, 5 or 7).
+
+    Analytic in the centres: on a sphere that runs true, an offset across the feed shows in
+    second order only, and the rounding of differences would pass for knowledge of it.
+    """
+    slides = (scan.x, scan.y, scan.z)
+    points = workpiece_points(_with(geometry, unknown), slides, scan.b, scan.c, scan.distance)
+    away = np.stack(points) - unknown[2:5, np.newaxis] * MICROMETRE_M
+    x, y, z = away / np.sqrt(np.sum(away**2, axis=0))
+    cosine, sine = np.cos(scan.c), np.sin(scan.c)
+    columns = [y * sine - x * cosine, -x * sine - y * cosine, -x, -y, -z]
+    for k in range(5, len(unknown)):
+        # The reach of the beam is all but linear in its lean: a difference over a milliradian.
+        step = np.zeros_like(unknown)
+        step[k] = 0.5
+        ends = [
+            np.stack(
+                workpiece_points(
+                    _with(geometry, unknown + sign * step), slides, scan.b, scan.c, scan.distance
+                )
+            )
+            for sign in (1, -1)
+        ]
+        columns.append(np.sum((ends[0] - ends[1]) * [x, y, z], axis=0) / MICROMETRE_M)
+    return np.stack(columns, axis=1)
+
+
+def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool) -> FloatArray:
+    """Return the sphere's centre one radius off the lowest or highest of a fitted paraboloid."""
+    points = workpiece_points(geometry, (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance)
+    ones = np.ones(len(points.x))
+    terms = np.stack([ones, points.x, points.y, points.x**2 + points.y**2], axis=1)
+    level, slope_x, slope_y, _ = least_squares(terms, points.height)
+    centre = np.array([-slope_x * radius, -slope_y * radius, level + radius]) / MICROMETRE_M
+    known = np.array([geometry.centre_x, geometry.centre_y]) / MICROMETRE_M
+    lean = np.array([geometry.beam_x, geometry.beam_y]) / _SLOPE_UNIT
+    return np.concatenate([known, centre, lean if beam else lean[:0]])
+
+
+def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the standard uncertainties, residuals taken as correlated within groups of points."""
+    # Through the singular values of scaled columns: the normal equations would square the
+    # condition number, and with it lose what is barely known.
+    unit, scale = unit_columns(jacobian)
+    _, values, rows = np.linalg.svd(unit, full_matrices=False)
+    if values[-1] <= _SINGULAR * values[0]:
+        raise DataError(
+            "the scan does not show where the spindle's centre lies: the probe hardly moved over "
+            "the sphere; scan across it while the spindle turns"
+        )
+    root = rows.T / values / scale[:, np.newaxis]
+    inverse = root @ root.T
+    edges = np.arange(0, len(residual), _GROUP_POINTS)
+    scores = np.add.reduceat(jacobian * residual[:, np.newaxis], edges, axis=0)
+    correction = len(scores) / (len(scores) - 1)
+    covariance = inverse @ (correction * scores.T @ scores) @ inverse
+    with np.errstate(invalid="ignore"):  # what the scan does not show may round below zero
+        return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
+
+
+def _thinned(scan: SphereScan) -> SphereScan:
+    samples = len(scan.z)
+    good = np.all([np.isfinite(getattr(scan, name)) for name in _COLUMNS], axis=0)
+    if np.count_nonzero(good) < _MIN_POINTS:
+        raise DataError(
+            f"scan of {int(np.count_nonzero(good))} finite points of {samples}, "
+            f"expected {_MIN_POINTS} or more"
+        )
+    used = np.flatnonzero(good)[:: -(-samples // _MAX_POINTS)]
+    return SphereScan(**{name: getattr(scan, name)[used] for name in _COLUMNS})

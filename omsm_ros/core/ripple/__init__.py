@@ -1,0 +1,1 @@
+"""Lines in the spectra of scans, and their sources."""

@@ -1,0 +1,347 @@
+"""What is no ripple: the part's form, its tilt and the drift, millimetres above nanometres.
+
+On a turned part Zernike polynomials over the scanned disc, of no higher degree than the data
+ask for, beside what repeats with the spindle alike at every radius, which no figure of a part
+can do at its centre. Elsewhere polynomials of time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import comb
+from typing import TypeAlias
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from omsm_ros.core.ripple.scan_signal import ScanSignal
+from omsm_ros.core.streams.blocks import FloatArray
+
+Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
+"""Columns (m, q) of what is to be fitted beside the form, at the samples (m,) asked for."""
+
+# Fewer turns do not show what repeats with the turn.
+LEAST_TURNS = 1.5
+# Harmonics of a turn that may be the spindle's beside the figure's.
+HIGHEST_ORDER = 12
+# One wave a turn is how the part sits on the chuck.
+LOWEST_ORDER = 2
+# On one circle two waves are its astigmatism, too.
+LOWEST_ON_CIRCLE = 3
+# In time a scan that turns may drift as a cubic; what bends more is looked for as a line.
+_DRIFT_DEGREE = 3
+# Even, for symmetric form is; as Zernike terms are written. The high ones only where they are worth
+# it, for the columns grow with the square.
+_DEGREES = range(2, 15, 2)
+_USUAL_DEGREE = 6
+# A higher degree has to take away this share of what is left, or it fits noise and lines; less
+# where the lines are known and taken out before.
+_WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
+# Even samples that determine the form; it is smooth, and the rest would only cost time.
+_MOST_FITTED = 100_000
+# Samples at a time: 150 columns of them are 20 MB.
+_CHUNK = 16_384
+# So many times what an order and a figure make together, one of them is no longer known.
+_AGAINST = 1.5
+# Nearer to a whole number of waves a turn, in resolutions, it is one.
+_OWNED = 0.6
+# Radii within this part of the largest are one circle.
+_CIRCLE = 0.02
+# Directions that the scan determines worse than this, of its best, stay at zero.
+_LEAST_DETERMINED = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """``cosine · cos(2π order · turn) + sine · sin(…)`` [m], alike at every radius.
+
+    uncertainty: standard, of cosine and of sine [m]
+    """
+
+    order: int
+    cosine: float
+    sine: float
+    uncertainty: float
+
+    @property
+    def amplitude(self) -> float:
+        """Half of peak to valley [m]."""
+        return float(np.hypot(self.cosine, self.sine))
+
+
+@dataclass(frozen=True, eq=False)
+class Formless:
+    """A scan without its form.
+
+    residual: what is left (n,) [m];  degree: of the polynomials;  removed: rms of the form [m]
+    orders: what repeats with the spindle, taken out as well
+    on_circle: True where figure and spindle are not separable, for there is one radius
+    """
+
+    residual: FloatArray
+    degree: int
+    removed: float
+    orders: tuple[Order, ...]
+    on_circle: bool
+
+
+class FormFit:
+    """Form and orders of one scan, fitted once or again after its lines have become known."""
+
+    def __init__(self, signal: ScanSignal) -> None:
+        self._signal = signal
+        self._height = signal.height - np.mean(signal.height)
+        every = max(len(signal) // _MOST_FITTED, 1)
+        self._chosen = np.arange(0, len(signal), every)
+        self._degree = self._enough(self._height, _WORTH)
+
+    @property
+    def _basis(self) -> _Basis:
+        return _Basis.of(self._signal).up_to(self._degree)
+
+    def _enough(self, values: FloatArray, worth: float) -> int:
+        """Return the degree beyond which nothing worth it is removed; few parts need a high one."""
+        for top in (_USUAL_DEGREE, max(_DEGREES)):
+            basis = _Basis.of(self._signal).up_to(top)
+            gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
+            energy = float(np.sum(values[self._chosen] ** 2))
+            degree = _enough(basis, gram, moment, energy, worth)
+            # Of what that leaves, for rounding of millimetres would look like form of its own.
+            kept = basis.within(degree)
+            some = self._some()
+            columns = basis.columns(self._signal, some)
+            left = values[some] - columns[:, kept] @ _solved(gram, moment, kept)
+            gram, moment = columns.T @ columns, columns.T @ left
+            degree = _beyond(basis, gram, moment, float(left @ left), worth, degree)
+            if degree < top:
+                break
+        return degree
+
+    def _some(self) -> np.ndarray:
+        """Return the samples that show whether a degree is worth it: drawn, to fold nothing."""
+        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
+        return np.asarray(self._chosen[np.sort(drawn)])
+
+    def refine(self, heights: FloatArray) -> None:
+        """Choose the degree again, once the ``heights`` of all lines (n,) [m] are known."""
+        bare = self._height - heights
+        self._degree = max(self._degree, self._enough(bare, _WORTH_WITHOUT_LINES))
+
+    def without(self, waves: Waves | None = None) -> Formless:
+        """Take form, drift and orders out, as they are beside ``waves``, which stay in."""
+        basis, signal, chosen = self._basis, self._signal, self._chosen
+        own = len(basis.names)
+        gram, moment = _normal_equations(basis, signal, self._height, chosen, waves)
+        inverse = _inverse(gram)
+        solution = np.zeros(len(gram))
+        residual = self._height
+        for _ in range(2):  # the second takes out what rounding left of millimetres
+            solution += inverse @ moment
+            residual = self._height - _evaluated(basis, signal, solution[:own])
+            bare = (
+                residual if waves is None else residual - _waves_of(waves, signal, solution[own:])
+            )
+            _, moment = _normal_equations(basis, signal, bare, chosen, waves)
+        variance = float(np.mean(bare[chosen] ** 2))
+        spread = np.sqrt(np.maximum(np.diag(inverse)[:own], 0.0) * variance)
+        return Formless(
+            residual=residual,
+            degree=self._degree,
+            removed=float(np.std(self._height - residual)),
+            orders=tuple(_orders(basis, solution, spread, gram / len(chosen))),
+            on_circle=basis.on_circle,
+        )
+
+    def owned(self) -> list[tuple[float, float]]:
+        """Return waves a turn that belong to form and orders, and how many resolutions about each.
+
+        A harmonic with q radial functions reaches q/2 resolutions to either side.
+        """
+        if self._signal.turns < LEAST_TURNS:
+            return []
+        radial = Counter(abs(m) for kind, _, m in self._basis.names if kind == "form" and m >= 0)
+        highest = max([HIGHEST_ORDER, *radial])
+        return [(float(k), _OWNED + 0.5 * radial[k]) for k in range(1, highest + 1)]
+
+
+def without_form(signal: ScanSignal) -> Formless:
+    """Take form, drift and what repeats with the spindle out of the heights of ``signal``."""
+    return FormFit(signal).without()
+
+
+@dataclass(frozen=True, eq=False)
+class _Basis:
+    """Names of the columns: (kind, degree, harmonic); kinds are drift, order and form."""
+
+    names: tuple[tuple[str, int, int], ...]
+    on_circle: bool
+    largest: float
+
+    @classmethod
+    def of(cls, signal: ScanSignal) -> _Basis:
+        largest = float(signal.radius.max()) or 1.0
+        on_circle = float(np.ptp(signal.radius)) < _CIRCLE * largest
+        top = max(_DEGREES)
+        if signal.turns < LEAST_TURNS:
+            return cls(tuple(("drift", n, 0) for n in range(top + 1)), False, largest)
+        names = [("drift", n, 0) for n in range(_DRIFT_DEGREE + 1)]
+        names += [("order", k, s * k) for k in range(1, HIGHEST_ORDER + 1) for s in (1, -1)]
+        if not on_circle:
+            names += [
+                ("form", n, s * k)
+                for n in range(2, top + 1)
+                for k in range(n % 2, n + 1, 2)
+                for s in ((1, -1) if k else (1,))
+            ]
+            names += [("form", 1, 1), ("form", 1, -1)]
+        return cls(tuple(names), on_circle, largest)
+
+    def up_to(self, degree: int) -> _Basis:
+        """Return only the columns that a fit of ``degree`` has."""
+        kept = tuple(name for name in self.names if self.degree(name) <= degree)
+        return replace(self, names=kept)
+
+    def within(self, degree: int) -> np.ndarray:
+        """Return the places of the columns that a fit of ``degree`` has, (q,)."""
+        return np.flatnonzero([self.degree(name) <= degree for name in self.names])
+
+    def degree(self, name: tuple[str, int, int]) -> int:
+        """Return the degree from which on the fit has a column; without turns, of time."""
+        kind, n, _ = name
+        free = kind == "order" or (kind == "drift" and n <= _DRIFT_DEGREE and self._turning)
+        return 0 if free else n
+
+    @property
+    def _turning(self) -> bool:
+        return any(kind == "order" for kind, _, _ in self.names)
+
+    def columns(self, signal: ScanSignal, chosen: np.ndarray) -> FloatArray:
+        """Return the values of all columns at the samples ``chosen`` (m,): (m, p)."""
+        time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
+        rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
+        highest = max((abs(m) for _, _, m in self.names), default=0)
+        turns = {k: np.exp(1j * k * angle) for k in range(highest + 1)}
+        found = np.empty((len(chosen), len(self.names)))
+        for place, (kind, n, m) in enumerate(self.names):
+            wave = turns[abs(m)].real if m >= 0 else turns[-m].imag
+            if kind == "drift":
+                found[:, place] = legendre.legval(time, [0.0] * n + [1.0])
+            elif kind == "order":
+                found[:, place] = wave
+            else:
+                found[:, place] = _radial(n, abs(m), rho) * wave
+        return found
+
+
+def _radial(degree: int, harmonic: int, rho: FloatArray) -> FloatArray:
+    """Return the radial part of a Zernike polynomial, by its sum (Noll 1976, Eq. 2)."""
+    half = (degree - harmonic) // 2
+    terms = [
+        (-1) ** s * comb(degree - s, s) * comb(degree - 2 * s, half - s) for s in range(half + 1)
+    ]
+    return np.asarray(np.polyval(terms, rho**2) * rho**harmonic)
+
+
+def _normal_equations(
+    basis: _Basis,
+    signal: ScanSignal,
+    values: FloatArray,
+    chosen: np.ndarray,
+    waves: Waves | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    gram, moment = np.zeros((0, 0)), np.zeros(0)
+    for first in range(0, len(chosen), _CHUNK):
+        part = chosen[first : first + _CHUNK]
+        columns = basis.columns(signal, part)
+        if waves is not None:
+            columns = np.hstack([columns, waves(part)])
+        if not len(gram):
+            gram, moment = np.zeros((columns.shape[1],) * 2), np.zeros(columns.shape[1])
+        gram += columns.T @ columns
+        moment += columns.T @ values[part]
+    return gram, moment
+
+
+def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatArray:
+    parts = [
+        waves(np.arange(first, min(first + _CHUNK, len(signal)))) @ solution
+        for first in range(0, len(signal), _CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
+def _enough(
+    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
+) -> int:
+    """Return the degree beyond which nothing worth it is taken away."""
+    highest = max(map(basis.degree, basis.names))
+    left, kept = energy, 0
+    for degree in (d for d in _DEGREES if d <= highest):
+        columns = basis.within(degree)
+        solution = _solved(gram, moment, columns)
+        now = energy - float(solution @ moment[columns])
+        if degree > _DEGREES[0] and now > (1 - worth) * left:
+            break
+        left, kept = now, degree
+    return kept
+
+
+def _beyond(
+    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float, degree: int
+) -> int:
+    """Return a higher degree that is worth all those up to it, ``degree`` if none is.
+
+    Six lobes are nothing to the fourth degree, and all to the sixth.
+    """
+    highest = max(map(basis.degree, basis.names))
+    left = energy
+    for higher in (d for d in _DEGREES if degree < d <= highest):
+        columns = basis.within(higher)
+        now = energy - float(_solved(gram, moment, columns) @ moment[columns])
+        if now <= (1 - worth) ** ((higher - degree) // _DEGREES.step) * left:
+            left, degree = now, higher
+    return degree
+
+
+def _solved(gram: FloatArray, moment: FloatArray, columns: np.ndarray) -> FloatArray:
+    return np.asarray(_inverse(gram[np.ix_(columns, columns)]) @ moment[columns])
+
+
+def _inverse(gram: FloatArray) -> FloatArray:
+    scale = 1 / np.sqrt(np.diag(gram))
+    values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+    kept = values > _LEAST_DETERMINED * values[-1]
+    half = vectors[:, kept] / np.sqrt(values[kept]) * scale[:, np.newaxis]
+    return np.asarray(half @ half.T)
+
+
+def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> FloatArray:
+    parts = [
+        basis.columns(signal, np.arange(first, min(first + _CHUNK, len(signal)))) @ solution
+        for first in range(0, len(signal), _CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
+def _orders(
+    basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
+) -> Iterator[Order]:
+    """Yield the orders that stand by themselves; ``mean``: of products of columns (p, p).
+
+    Where the radius changes little, an order and a figure of the same harmonic may grow large
+    against each other: neither is known then, and the order counts as form.
+    """
+    found = {name: place for place, name in enumerate(basis.names) if name[0] == "order"}
+    lowest = LOWEST_ON_CIRCLE if basis.on_circle else LOWEST_ORDER
+    for k in range(lowest, HIGHEST_ORDER + 1):
+        if ("order", k, k) in found:
+            cosine, sine = found["order", k, k], found["order", k, -k]
+            worse = float(max(spread[cosine], spread[sine]))
+            own = Order(k, float(solution[cosine]), float(solution[sine]), worse)
+            alike = [i for i, (kind, _, m) in enumerate(basis.names) if abs(m) == k]
+            part = solution[alike]
+            together = float(part @ mean[np.ix_(alike, alike)] @ part)
+            if own.amplitude**2 / 2 <= _AGAINST**2 * together:
+                yield own

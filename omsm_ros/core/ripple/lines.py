@@ -1,0 +1,268 @@
+"""The lines of a scan: found one after the other, fitted together.
+
+The strongest line in any coordinate is taken, all lines so far are fitted at once (frequency,
+cosine, sine: Gauss-Newton), and the search goes on in what they leave: lines closer than a
+window's main lobe come apart, and a strong one hides no weak one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omsm_ros.core.ripple.coordinates import (
+    LEAST_WAVES,
+    OVERSAMPLING,
+    Coordinate,
+    coordinates_of,
+    floor_of,
+    power_over,
+    same_line,
+)
+from omsm_ros.core.ripple.density import ratio_at, significance
+from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.spectral_line import (
+    CLOSEST,
+    Line,
+    fitted,
+    in_their_coordinates,
+    start,
+    sum_of,
+)
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Noise alone shows such a line in one spectrum of 740.
+LEAST_SIGMA = 3.0
+# Of three columns each; a machine shows ten or twenty, and each further one costs a fit of all.
+MOST_LINES = 40
+# Of the strongest that is left: weaker ones may be its side lobes.
+_TAKEN_TOGETHER = 0.3
+# Resolutions from a strong line, within which a weaker peak may be its side lobe.
+_APART_BINS = 8
+# Samples from one place to the next at which the rings are looked at.
+_STRIDE = 50
+# A line and its like in another coordinate, of which that one takes more of the power.
+_SHADOW, _SHADOW_BINS = 0.3, 30
+# A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
+# and more of its power than jitter and encoders do.
+_LOST_RATIO, _LOST_SHARE = 12.5, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class LineSpectrum:
+    """The lines of a signal, strongest first, and the noise about them.
+
+    residual: without the lines (n,);  noise: its rms
+    amplitude_floor: σ of an amplitude over time at ``floor_frequency`` (m,) [Hz]
+    """
+
+    lines: tuple[Line, ...]
+    coordinates: dict[str, Coordinate]
+    residual: FloatArray
+    noise: float
+    floor_frequency: FloatArray
+    amplitude_floor: FloatArray
+
+    def sigma_at(self, frequency: float) -> float:
+        """Return the standard deviation of an amplitude over time at ``frequency`` [Hz]."""
+        return float(np.interp(frequency, self.floor_frequency, self.amplitude_floor))
+
+
+def find_lines(
+    signal: ScanSignal,
+    values: FloatArray,
+    known: Sequence[Line] = (),
+    owned: Sequence[tuple[float, float]] = (),
+) -> LineSpectrum:
+    """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
+
+    known: lines found before, to start with
+    owned: waves a turn that are no lines of their own, and how many resolutions about each
+    """
+    coordinates = coordinates_of(signal)
+    searched = [c for c in coordinates.values() if c.like == c.name]
+    reserved = _reserved(coordinates, owned)
+    lines = _free(fitted(list(known), coordinates, values), coordinates, reserved) if known else []
+    residual = values - sum_of(lines, coordinates, len(values))
+    taken = {name: list(places) for name, places in reserved.items()}
+    for _ in range(MOST_LINES):
+        new = _strongest(signal, residual, searched, lines, taken)
+        if not new:
+            break
+        for line in new:  # what moved away in the fit is not found again
+            taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
+        new = [line for line in new if not _is_shadow(line, lines, coordinates)]
+        if not new:
+            continue
+        lines = fitted(lines + new, coordinates, values)
+        residual = values - sum_of(lines, coordinates, len(values))
+        lines = in_their_coordinates(lines, new, coordinates, residual)
+        lines = _free(lines, coordinates, reserved)
+        residual = values - sum_of(lines, coordinates, len(values))
+    return _judged(signal, lines, coordinates, residual)
+
+
+def _strongest(
+    signal: ScanSignal,
+    residual: FloatArray,
+    searched: Sequence[Coordinate],
+    known: Sequence[Line],
+    taken: Mapping[str, Sequence[tuple[float, float]]],
+) -> list[Line]:
+    """Return the strongest lines left, all of one coordinate."""
+    best: tuple[float, list[Line]] = (0.0, [])
+    for coordinate in searched:
+        power, spacing = power_over(signal, residual, coordinate)
+        tried = len(power) / OVERSAMPLING
+        ratio = power / floor_of(power)
+        least = np.arange(len(power)) * spacing < LEAST_WAVES * coordinate.resolution
+        ratio[least] = 0.0
+        lines = [(k.frequency, CLOSEST) for k in known if k.coordinate == coordinate.name]
+        for frequency, bins in (*lines, *taken.get(coordinate.name, ())):
+            place, half = frequency / spacing, bins * OVERSAMPLING
+            ratio[max(int(np.ceil(place - half)), 0) : max(int(place + half) + 1, 0)] = 0.0
+        peaks = _peaks(ratio, ratio_at(LEAST_SIGMA, tried))
+        if len(peaks) and power[peaks[0]] > best[0]:
+            # An amplitude only to start with; the fit gives phase and frequency.
+            strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
+            places = _spaced(strong, MOST_LINES - len(known))
+            new = [start(coordinate, k * spacing, residual) for k in places]
+            best = float(power[peaks[0]]), new
+    return best[1]
+
+
+def _reserved(
+    coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
+) -> dict[str, list[tuple[float, float]]]:
+    """Return frequencies of ``owned`` waves a turn, over turns, over time, and along all rings."""
+    turn, path = coordinates.get(TURN), coordinates.get(PATH)
+    if turn is None:
+        return {}
+    found = {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
+    if path is not None:
+        # So many turns are in a metre of the innermost ring, and of the outermost.
+        along = abs(np.diff(path.values[::_STRIDE]))
+        ring = abs(np.diff(turn.values[::_STRIDE]))[along > 0] / along[along > 0]
+        most, least = float(np.max(ring)), float(np.min(ring))
+        found[PATH] = [
+            (
+                order * (most + least) / 2,
+                bins + order * (most - least) / 2 / path.resolution,
+            )
+            for order, bins in owned
+        ]
+    return found
+
+
+def _is_shadow(new: Line, known: Sequence[Line], coordinates: dict[str, Coordinate]) -> bool:
+    """Return True for the image of a known line in another coordinate.
+
+    A fit of both would let them grow against each other.
+    """
+    own = coordinates[new.coordinate]
+    for line in known:
+        other = coordinates[line.coordinate]
+        apart = abs(line.frequency * other.pace - new.frequency * own.pace)
+        if other.name == own.name or apart > _SHADOW_BINS * own.resolution * own.pace:
+            continue
+        share, frequency = same_line(other, line.frequency, own)
+        if share > _SHADOW and abs(frequency - new.frequency) < 2 * own.resolution:
+            return True
+    return False
+
+
+def _free(
+    lines: list[Line],
+    coordinates: dict[str, Coordinate],
+    reserved: Mapping[str, Sequence[tuple[float, float]]],
+) -> list[Line]:
+    """Return ``lines`` without those that have moved to where form and orders are."""
+    return [
+        line
+        for line in lines
+        if all(
+            abs(line.frequency - frequency) > bins * coordinates[line.coordinate].resolution
+            for frequency, bins in reserved.get(line.coordinate, ())
+        )
+    ]
+
+
+def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
+    """Return the places of local maxima above ``least``, largest first."""
+    inner = ratio[1:-1]
+    top = (inner >= ratio[:-2]) & (inner > ratio[2:]) & (inner > least)
+    places = np.flatnonzero(top) + 1
+    if ratio[-1] > max(least, ratio[-2]):
+        places = np.r_[places, len(ratio) - 1]
+    return places[np.argsort(-ratio[places], kind="stable")]
+
+
+def _spaced(places: np.ndarray, most: int) -> list[int]:
+    """Return the first ``most`` of ``places`` that are apart from those before."""
+    kept: list[int] = []
+    for place in places:
+        if len(kept) >= most:
+            break
+        if all(abs(int(place) - k) >= _APART_BINS * OVERSAMPLING for k in kept):
+            kept.append(int(place))
+    return kept
+
+
+def _judged(
+    signal: ScanSignal,
+    lines: list[Line],
+    coordinates: dict[str, Coordinate],
+    residual: FloatArray,
+) -> LineSpectrum:
+    """Return the lines with their uncertainties, those that stand out of what all of them leave."""
+    floors = {}
+    for name in {TIME, *(line.coordinate for line in lines)}:
+        power, spacing = power_over(signal, residual, coordinates[name])
+        grid = np.asarray(np.arange(len(power)) * spacing, np.float64)
+        floors[name] = grid, floor_of(power)
+    found = []
+    for line in lines:
+        frequency, floor = floors[line.coordinate]
+        variance = float(np.interp(line.frequency, frequency, floor)) / 2
+        ratio = line.amplitude**2 / (2 * variance)
+        sigma = float(significance(np.array(ratio), len(frequency) / OVERSAMPLING))
+        if sigma >= LEAST_SIGMA:
+            coordinate = coordinates[line.coordinate]
+            found.append(
+                replace(
+                    line,
+                    amplitude_uncertainty=variance**0.5,
+                    # Cramér-Rao for a line in white noise over an even range.
+                    frequency_uncertainty=np.sqrt(1.5 / ratio) / np.pi * coordinate.resolution,
+                    significance=sigma,
+                    possible=_possible(line, ratio, coordinates),
+                )
+            )
+    found.sort(key=lambda one: -one.amplitude)
+    frequency, floor = floors[TIME]
+    return LineSpectrum(
+        lines=tuple(found),
+        coordinates=coordinates,
+        residual=residual,
+        noise=float(np.std(residual)),
+        floor_frequency=frequency,
+        amplitude_floor=np.sqrt(floor / 2),
+    )
+
+
+def _possible(line: Line, ratio: float, coordinates: dict[str, Coordinate]) -> dict[str, float]:
+    """Return the coordinates in which the data allow it to be a line, with the frequency there."""
+    own = coordinates[line.coordinate]
+    found = {line.coordinate: line.frequency}
+    for name, other in coordinates.items():
+        if name == line.coordinate:
+            continue
+        if own.like == other.like:
+            found[name] = line.frequency * own.pace / other.pace
+            continue
+        share, frequency = same_line(own, line.frequency, other)
+        if (1 - share) * ratio < _LOST_RATIO or 1 - share < _LOST_SHARE:
+            found[name] = frequency
+    return found

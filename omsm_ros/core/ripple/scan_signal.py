@@ -1,0 +1,208 @@
+"""A scan as its spectra see it: height over time, path, radius and turns of the spindle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from omsm_ros.core.kinematics.kinematics import workpiece_xy
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.errors import DataError
+
+TIME, PATH, RADIUS, TURN = "time", "path", "radius", "turn"
+
+# As few frequencies as a floor of noise can be found among.
+_LEAST_POINTS = 256
+# Below a hundredth of a turn the spindle is at rest but for its encoder's noise.
+_LEAST_TURN = 0.01
+# Feed and spindle keep their pace over such a part of a scan; it averages an encoder's noise.
+_STRETCHES = 200
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanSignal:
+    """A scan, each array (n,), in the order of time; samples without a reading are not in it.
+
+    period: from reading to reading where none is lost [s];  sample: their count from the first
+    height: of the surface [m];  path: how far the probe has gone over the part [m]
+    radius: from the spindle axis [m];  turn: of the spindle [turns]
+    """
+
+    name: str
+    period: float
+    sample: IntArray
+    height: FloatArray
+    path: FloatArray
+    radius: FloatArray
+    turn: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+    @property
+    def rate(self) -> float:
+        """Samples a second [Hz]."""
+        return 1.0 / self.period
+
+    @property
+    def time(self) -> FloatArray:
+        """Since the first sample [s], (n,)."""
+        return np.asarray(self.sample * self.period, np.float64)
+
+    @property
+    def duration(self) -> float:
+        """From the first sample to the end of the last [s]."""
+        return float((self.sample[-1] - self.sample[0] + 1) * self.period)
+
+    @property
+    def turns(self) -> float:
+        """By which the spindle has turned."""
+        return float(np.ptp(self.turn))
+
+    def coordinate(self, name: str) -> FloatArray:
+        """Return one of time [s], path [m], radius [m] and turn [turns], (n,)."""
+        return np.asarray(getattr(self, name), np.float64)
+
+
+def scan_signal(
+    name: str,
+    period: float,
+    readings: tuple[IntArray, FloatArray],
+    axes: tuple[IntArray, FloatArray, FloatArray, FloatArray],
+) -> ScanSignal:
+    """Return the signal of a scan.
+
+    readings: trigger counts (n,) and heights (n,) [m]
+    axes: trigger counts (m,), slides x, y [m] and spindle c [rad], each (m,)
+
+    Where the trigger starts anew, the longest run is taken. The axes are interpolated where they
+    have gaps. Raises DataError for a scan of too few points.
+    """
+    sample, height = _longest_run(*readings)
+    count, x, y, c = _longest_run(*axes)
+    known = np.isfinite(x) & np.isfinite(y) & np.isfinite(c)
+    if len(sample) < _LEAST_POINTS or np.count_nonzero(known) < _LEAST_POINTS:
+        raise DataError(
+            f"scan {name!r} has {len(sample)} readings and {np.count_nonzero(known)} positions "
+            f"on end, expected {_LEAST_POINTS} or more of each; record a longer scan"
+        )
+    count, x, y, c = (values[known] for values in (count, x, y, c))
+    turn = counted_on(count, c) / (2 * np.pi)
+    inside = (sample >= count[0]) & (sample <= count[-1])
+    sample, height = sample[inside], height[inside]
+    if len(sample) < _LEAST_POINTS:
+        raise DataError(
+            f"scan {name!r} has {len(sample)} readings between the trigger numbers of its "
+            f"positions, expected {_LEAST_POINTS} or more; record both from the same triggers"
+        )
+    # Read at every other trigger, a line would be two: itself and its image within half the rate.
+    every = int(np.gcd.reduce(np.diff(sample)))
+    columns = (track(x, y, turn), np.hypot(x, y), turn)
+    path, radius, turn = (np.interp(sample, count, values) for values in columns)
+    return ScanSignal(
+        name=name,
+        period=every * period,
+        sample=(sample - sample[0]) // every,
+        height=height,
+        path=path,
+        radius=radius,
+        turn=turn,
+    )
+
+
+def counted_on(count: IntArray, angle: FloatArray) -> FloatArray:
+    """Return an encoder's angle (n,) [rad] counted on over its turns.
+
+    An encoder that starts anew each turn is recognised by its range; over a gap of the trigger
+    ``count`` (n,) the spindle is taken to have kept its median pace.
+    """
+    step, gap = np.diff(angle), np.diff(count)
+    if np.ptp(angle) > 2 * np.pi * 1.001 or not np.any(abs(step) > np.pi):
+        return angle
+    next_ones = gap == np.min(gap)
+    pace = np.median(np.remainder(step[next_ones] + np.pi, 2 * np.pi) - np.pi) / np.min(gap)
+    expected = pace * gap
+    whole = np.rint((step - expected) / (2 * np.pi)) * 2 * np.pi
+    return np.asarray(np.r_[angle[0], angle[0] + np.cumsum(step - whole)])
+
+
+def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return how far the probe has gone over the part [m], (n,).
+
+    x, y: of the slides [m];  turn: of the spindle [turns]
+
+    Noise of the encoders does not add up: on a turning part ``ds = √(r² + (dr/dc)²) dc`` with
+    dr/dc smooth; else every step is taken along the smooth direction of the motion.
+    """
+    if np.ptp(turn) > _LEAST_TURN:
+        angle = 2 * np.pi * turn
+        radius = np.hypot(x, y)
+        knots, slopes = _slopes(angle, radius)
+        lever = np.hypot(radius, np.interp(np.arange(len(x)), knots, slopes))
+        steps = 0.5 * (lever[1:] + lever[:-1]) * np.diff(angle)
+        return np.asarray(np.r_[0.0, np.cumsum(steps)] * np.sign(angle[-1] - angle[0]))
+    across, along = workpiece_xy(x, y, 2 * np.pi * turn)
+    place = np.arange(len(x), dtype=np.float64)
+    pace = [np.interp(place, *_slopes(place, p)) for p in (across, along)]
+    speed = np.hypot(*pace)
+    moving = speed > 0
+    unit = [np.divide(p, speed, out=np.zeros_like(p), where=moving) for p in pace]
+    steps = sum(
+        np.diff(p) * 0.5 * (u[1:] + u[:-1]) for p, u in zip((across, along), unit, strict=True)
+    )
+    return np.asarray(np.r_[0.0, np.cumsum(steps)])
+
+
+def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the middles of stretches, and the slope of ``values`` over ``over`` there."""
+    parts = min(_STRETCHES, len(over) // 8)
+    cuts = np.linspace(0, len(over), parts + 1).astype(np.int64)
+    length = np.diff(cuts)
+    mean = [np.add.reduceat(v, cuts[:-1]) / length for v in (over, values)]
+    run = np.gradient(mean[0])
+    slopes = np.gradient(mean[1]) / np.where(run == 0, np.inf, run)
+    return (cuts[:-1] + cuts[1:] - 1) / 2, slopes
+
+
+def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
+    """Return the longest part in which the trigger's count only rises."""
+    cuts = np.r_[0, np.flatnonzero(np.diff(count) <= 0) + 1, len(count)]
+    longest = int(np.argmax(np.diff(cuts)))
+    part = slice(cuts[longest], cuts[longest + 1])
+    return tuple(np.asarray(values[part]) for values in (count, *columns))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sampling:
+    """How finely a scan samples the part at one radius.
+
+    radius: [m];  distance: between samples along the path [m] (the paper's Table 1)
+    shortest_wavelength: that is not confused with its folded image, twice the distance [m]
+    """
+
+    radius: float
+    distance: float
+    shortest_wavelength: float
+
+
+def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
+    """Return the sampling at ``places`` radii, outermost first; one place on a circle."""
+    samples = np.diff(signal.sample)
+    distance = abs(np.diff(signal.path)) / samples
+    middle = 0.5 * (signal.radius[1:] + signal.radius[:-1])
+    low, high = float(middle.min()), float(middle.max())
+    if high - low < 0.01 * max(high, 1e-12):
+        return [_sampling(middle, distance)]
+    rings = [
+        (middle <= outer) & (middle >= inner)
+        for outer, inner in pairwise(np.linspace(high, low, places + 1))
+    ]
+    return [_sampling(middle[ring], distance[ring]) for ring in rings if ring.any()]
+
+
+def _sampling(radius: FloatArray, distance: FloatArray) -> Sampling:
+    typical = float(np.median(distance))
+    middle = float(np.median(radius))
+    return Sampling(radius=middle, distance=typical, shortest_wavelength=2 * typical)

@@ -1,0 +1,491 @@
+"""Where would a line be seen in another scan, if it were on the part, a vibration, the spindle?
+
+A line is the same wavelength over the part (along the path, or from ring to ring), the same
+frequency in time, or the same number a turn. Each says where to look in every other scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from omsm_ros.core.ripple.accelerometer import Felt
+from omsm_ros.core.ripple.coordinates import LEAST_WAVES, Coordinate
+from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER, Formless
+from omsm_ros.core.ripple.lines import LineSpectrum
+from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.spectral_line import Line
+
+PART, VIBRATION, SYNCHRONOUS = "on the part", "vibration", "synchronous spindle error"
+FOLDED, ARTEFACT, UNDECIDED = "folded vibration", "artefact of sampling", "undecided"
+KINDS = (PART, VIBRATION, FOLDED, SYNCHRONOUS, ARTEFACT, UNDECIDED)
+
+# Harmonics of a turn that bearings, motor and drawbar make; more waves a turn are texture.
+HIGHEST_SYNCHRONOUS = 500
+# With fewer turns everything is near a whole number of waves a turn.
+_LEAST_TURNS = 4.0
+# A vibration from 0 to so many times the sampling rate is looked for behind its image.
+_MOST_FOLDS = 5
+# Mains keep their frequency to 2e-4 (ENTSO-E: ±10 mHz of 50 Hz most of the time); a feed and a
+# radius are known to 1e-4.
+_STEADY = {TIME: 2e-4, PATH: 1e-4, RADIUS: 1e-4, TURN: 1e-5}
+# Standard uncertainties of a frequency; parts of a resolution that window and fit may leave.
+_TIMES_UNCERTAINTY, _OWN_BIN, _OTHER_BIN = 4.0, 0.3, 0.1
+# A place so wide that some line is likely to lie in it by chance tells nothing.
+_GREATEST_CHANCE = 0.1
+# Expected amplitude over its σ, from which an absent line is really absent.
+_WOULD_BE_SEEN = 9.0
+# The same line may be so many times as strong in another scan.
+_AMPLITUDES = 3.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StudiedScan:
+    """A scan and all that was found in it; felt is None without an accelerometer.
+
+    lines: those of the spectrum and the orders that were found with the form
+    """
+
+    signal: ScanSignal
+    formless: Formless
+    spectrum: LineSpectrum
+    lines: tuple[Line, ...]
+    felt: Felt | None = None
+
+    @property
+    def coordinates(self) -> dict[str, Coordinate]:
+        """Those in which it moves."""
+        return self.spectrum.coordinates
+
+    def resolution(self, coordinate: str) -> float:
+        """Return the unit of frequencies: Hz, 1/m or 1/turn."""
+        return self.coordinates[coordinate].resolution
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A line as one of a ``kind``, of a true ``frequency`` in ``coordinate``.
+
+    uncertainty: of that frequency, with what the scan's length leaves open
+    folds: how often a vibration was folded before it was seen where it was
+    """
+
+    kind: str
+    coordinate: str
+    frequency: float
+    uncertainty: float
+    folds: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a hypothesis puts its line in a scan: ``tolerance`` about ``frequency``.
+
+    folded: True if it is the image of something beyond half the rate
+    """
+
+    coordinate: str
+    frequency: float
+    tolerance: float
+    folded: bool
+
+
+def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
+    """Yield what ``line`` of ``scan`` may be; of a vibration also what folds to it."""
+    if TIME in line.possible:
+        seen, spread = line.possible[TIME], spread_of(scan, line, TIME)
+        rate = scan.signal.rate
+        yield Hypothesis(VIBRATION, TIME, seen, spread)
+        for folds in range(1, _MOST_FOLDS + 1):
+            for image in (folds * rate - seen, folds * rate + seen):
+                yield Hypothesis(VIBRATION, TIME, image, spread, folds)
+    for coordinate in (PATH, RADIUS):
+        if coordinate in line.possible:
+            spread = spread_of(scan, line, coordinate)
+            yield Hypothesis(PART, coordinate, line.possible[coordinate], spread)
+    if (order := whole_order(scan, line)) is not None:
+        yield Hypothesis(SYNCHRONOUS, TURN, float(order), 0.0)
+
+
+def whole_order(scan: StudiedScan, line: Line) -> int | None:
+    """Return how many waves a turn the line has, if it is a whole number."""
+    if TURN not in line.possible or scan.signal.turns < _LEAST_TURNS:
+        return None
+    per_turn = line.possible[TURN]
+    order = round(per_turn)
+    own = scan.coordinates[TURN].resolution
+    allowed = _TIMES_UNCERTAINTY * _own_spread(scan, line, TURN) + _OWN_BIN * own
+    if not 1 <= order <= HIGHEST_SYNCHRONOUS or abs(per_turn - order) > allowed:
+        return None
+    return order
+
+
+def spread_of(scan: StudiedScan, line: Line, coordinate: str) -> float:
+    """Return how far the true frequency in ``coordinate`` may be from where the line was seen."""
+    return (
+        _TIMES_UNCERTAINTY * _own_spread(scan, line, coordinate)
+        + _OTHER_BIN * scan.resolution(coordinate)
+        + _STEADY[coordinate] * line.possible[coordinate]
+    )
+
+
+def _own_spread(scan: StudiedScan, line: Line, coordinate: str) -> float:
+    """Return the standard uncertainty of its frequency in ``coordinate``."""
+    share = scan.resolution(coordinate) / scan.resolution(line.coordinate)
+    return line.frequency_uncertainty * share
+
+
+def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
+    """Return where the line would be in ``scan``; None if the scan cannot show it."""
+    coordinate = scan.coordinates.get(hypothesis.coordinate)
+    if coordinate is None:
+        return None
+    if not coordinate.proportional_to_time:
+        fine = hypothesis.frequency > coordinate.highest
+        tolerance = hypothesis.uncertainty + _OWN_BIN * coordinate.resolution
+        return Place(coordinate.name, hypothesis.frequency, tolerance, fine)
+    in_time = hypothesis.frequency * coordinate.pace
+    rate = scan.signal.rate
+    seen = float(folded_frequency(in_time, rate))
+    tolerance = hypothesis.uncertainty * coordinate.pace + _OWN_BIN * scan.resolution(TIME)
+    return Place(TIME, seen, tolerance, in_time > rate / 2)
+
+
+def apart(one: Place | None, other: Place | None) -> bool:
+    """Return True if a scan in which two hypotheses have these places separates them."""
+    if one is None or other is None or one.coordinate != other.coordinate:
+        return True
+    return abs(one.frequency - other.frequency) > one.tolerance + other.tolerance
+
+
+def found_at(scan: StudiedScan, place: Place) -> Line | None:
+    """Return the line of ``scan`` at ``place``, the strongest if there are several."""
+    near = [
+        line
+        for line in scan.lines
+        if place.coordinate in line.possible
+        and abs(line.possible[place.coordinate] - place.frequency)
+        <= place.tolerance + _TIMES_UNCERTAINTY * _own_spread(scan, line, place.coordinate)
+    ]
+    return max(near, key=lambda line: line.amplitude, default=None)
+
+
+def by_chance(scan: StudiedScan, place: Place) -> float:
+    """Return how many lines of ``scan`` would lie at ``place`` if they lay anywhere."""
+    band = scan.coordinates[place.coordinate].highest
+    count = sum(place.coordinate in line.possible for line in scan.lines)
+    return count * 2 * place.tolerance / band
+
+
+def shows(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
+    """Return whether a line of ``amplitude`` [m] elsewhere is in ``scan``; None: undecidable."""
+    place = place_in(scan, hypothesis)
+    if place is None or by_chance(scan, place) > _GREATEST_CHANCE:
+        return None
+    line = found_at(scan, place)
+    if line is not None:
+        ratio = line.amplitude / amplitude
+        least = (
+            1 / _AMPLITUDES * (1.0 if hypothesis.kind != PART else _least_share(scan, hypothesis))
+        )
+        alike = hypothesis.kind == VIBRATION or least <= ratio <= _AMPLITUDES
+        return True if alike else None
+    return None if _may_hide(scan, hypothesis, place, amplitude) else False
+
+
+def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude: float) -> bool:
+    """Return True if the line could be there and not be found."""
+    if hypothesis.kind == VIBRATION:
+        return False  # the machine may stand still: absence is no proof, and is never used as one
+    if place.coordinate == TIME:
+        if place.frequency < (LEAST_WAVES + 1) * scan.resolution(TIME) or _near_form(scan, place):
+            return True
+        floor = scan.spectrum.sigma_at(place.frequency)
+    elif place.folded:
+        return True  # it is looked for only where another scan has found it
+    else:
+        floor = scan.spectrum.noise * np.sqrt(2 / len(scan.signal))
+    return amplitude * _least_share(scan, hypothesis) < _WOULD_BE_SEEN * floor
+
+
+def _near_form(scan: StudiedScan, place: Place) -> bool:
+    """Return True where taking out the form takes a line out as well."""
+    turn = scan.coordinates.get(TURN)
+    if turn is None:
+        return False
+    order = place.frequency / turn.pace
+    width = place.tolerance + (scan.formless.degree + 2) / 2 * scan.resolution(TIME)
+    nearest = round(order)
+    return nearest <= max(HIGHEST_ORDER, scan.formless.degree) and (
+        abs(order - nearest) * turn.pace < width
+    )
+
+
+def _least_share(scan: StudiedScan, hypothesis: Hypothesis) -> float:
+    """Return the share of a texture's amplitude that an average over a sample period leaves."""
+    coordinate = scan.coordinates[hypothesis.coordinate]
+    return float(abs(np.sinc(hypothesis.frequency * coordinate.pace * scan.signal.period)))
+
+
+# Which kinds does each line have evidence for, and which explanation needs the fewest things?
+#
+# A claim says what a line is, and names its partners: the lines of other scans that are the same
+# thing there, where no other kind would put it. Claims are settled one after the other, those
+# with most partners first; what one of them explains is evidence for nothing else.
+
+# A partner of that size, over the line's own, is explained by it and by nothing besides.
+_EXPLAINED = (0.7, 1.4)
+
+Key = tuple[int, int]
+"""Place of a scan, and of a line in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A line is of this ``kind``; by its partners, and with none that is missing.
+
+    texture: of an artefact, the line that another scan resolves
+    """
+
+    kind: str
+    hypothesis: Hypothesis
+    partners: tuple[Key, ...]
+    texture: Key | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A hypothesis of a line: partners where it is there, scans in which it is missing."""
+
+    hypothesis: Hypothesis
+    present: tuple[Key, ...]
+    absent: tuple[int, ...]
+
+    @property
+    def kind(self) -> str:
+        """Of the hypothesis."""
+        return self.hypothesis.kind
+
+    @property
+    def alive(self) -> bool:
+        """False if a scan that would have to show it does not; a vibration may come and go."""
+        return self.kind == VIBRATION or not self.absent
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Of one line: all hypotheses as tested, and the claims that follow."""
+
+    line: Line
+    tested: tuple[Tested, ...]
+    claims: tuple[Claim, ...]
+
+
+def evidence_of(scans: Sequence[StudiedScan]) -> dict[Key, Evidence]:
+    """Return the evidence for every line of every scan."""
+    keys = [(own, k) for own, scan in enumerate(scans) for k in range(len(scan.lines))]
+    tested = {key: tuple(_tests(scans, key)) for key in keys}
+    claims = {key: _claims(scans, tested[key]) for key in keys}
+    images = _images(scans, claims)
+    return {
+        key: Evidence(_line(scans, key), tested[key], (*claims[key], *images.get(key, ())))
+        for key in keys
+    }
+
+
+def _line(scans: Sequence[StudiedScan], key: Key) -> Line:
+    return scans[key[0]].lines[key[1]]
+
+
+def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[Tested]:
+    own, line = key[0], _line(scans, key)
+    for hypothesis in hypotheses_of(scans[own], line):
+        present, absent = [], []
+        for other, scan in enumerate(scans):
+            if other == own or (hypothesis.kind == PART and not _same_part(scans[own], scan)):
+                continue
+            shown = shows(scan, hypothesis, line.amplitude)
+            if shown:
+                place = place_in(scan, hypothesis)
+                present += [_key_at(other, scan, place)] if place is not None else []
+            elif shown is not None:
+                absent.append(other)
+        yield Tested(hypothesis, tuple(present), tuple(absent))
+
+
+def _key_at(own: int, scan: StudiedScan, place: Place) -> Key:
+    found = found_at(scan, place)
+    return own, next(k for k, line in enumerate(scan.lines) if line is found)
+
+
+def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
+    """Return True if the scans have rings of the part in common."""
+    a, b = one.signal.radius, other.signal.radius
+    low, high = max(a.min(), b.min()), min(a.max(), b.max())
+    return bool(high - low >= -0.02 * max(a.max(), b.max()))
+
+
+def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Claim, ...]:
+    """Return hypotheses that a scan separates from all other kinds, and that none contradicts."""
+    alive = [t for t in tested if t.alive]
+    found = []
+    for one in alive:
+        rivals = [t for t in alive if _is_rival(one, t)]
+        decisive = tuple(key for key in one.present if _decides(scans[key[0]], one, rivals))
+        if decisive:
+            found.append(Claim(one.kind, one.hypothesis, decisive))
+    return tuple(_least_folded(found))
+
+
+def _is_rival(one: Tested, other: Tested) -> bool:
+    """Return True for another kind, unless it folds: what folds is no rival of what does not."""
+    if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
+        return False  # on circles of one radius a figure of the part repeats just so
+    return one.kind != other.kind and not other.hypothesis.folds
+
+
+def _decides(scan: StudiedScan, one: Tested, rivals: Sequence[Tested]) -> bool:
+    place = place_in(scan, one.hypothesis)
+    return all(apart(place, place_in(scan, rival.hypothesis)) for rival in rivals)
+
+
+def _least_folded(found: list[Claim]) -> list[Claim]:
+    """Return the claims with one vibration: that in most scans, then the lowest frequency."""
+    shaken = [c for c in found if c.kind == VIBRATION]
+    if not shaken:
+        return found
+    best = min(shaken, key=lambda c: (-len(c.partners), c.hypothesis.frequency))
+    return [c for c in found if c.kind != VIBRATION] + [best]
+
+
+def _images(
+    scans: Sequence[StudiedScan], claims: dict[Key, tuple[Claim, ...]]
+) -> dict[Key, list[Claim]]:
+    """Return lines to which a texture that another scan resolves folds in a scan too coarse."""
+    found: dict[Key, list[Claim]] = {}
+    for key, own in claims.items():
+        for texture in own:
+            if texture.kind != PART or texture.hypothesis.coordinate != PATH:
+                continue
+            for partner in texture.partners:
+                place = place_in(scans[partner[0]], texture.hypothesis)
+                if place is not None and place.folded and place.coordinate == TIME:
+                    image = Claim(ARTEFACT, texture.hypothesis, (key,), key)
+                    found.setdefault(partner, []).append(image)
+    return found
+
+
+@dataclass
+class Settled:
+    """What each line is, as far as it is decided; ``also`` what else it holds."""
+
+    scans: Sequence[StudiedScan]
+    evidence: dict[Key, Evidence]
+    claim: dict[Key, Claim] = field(default_factory=dict)
+    also: dict[Key, Claim] = field(default_factory=dict)
+
+    def open_claims(self, key: Key) -> list[Claim]:
+        """Return the claims of a line whose partners are not all explained as something else.
+
+        All of them if none is left: a line is something.
+        """
+        every = self.evidence[key].claims
+        left = [c for c in every if any(self._may_be(p, c) for p in c.partners)]
+        return left or list(every)
+
+    def _may_be(self, partner: Key, claim: Claim) -> bool:
+        settled = self.claim.get(partner)
+        return settled is None or _family(settled.kind) == _family(claim.kind)
+
+    def settle(self, key: Key, claim: Claim) -> None:
+        """Decide, and with it what partners of its size are."""
+        self.claim[key] = claim
+        size = self.evidence[key].line.amplitude
+        for partner in claim.partners:
+            ratio = self.evidence[partner].line.amplitude / size
+            theirs = self._as_theirs(partner, claim, key)
+            if partner in self.claim:
+                if _family(self.claim[partner].kind) != _family(claim.kind):
+                    self.also.setdefault(partner, theirs or claim)
+            elif theirs is not None and _EXPLAINED[0] <= ratio <= _EXPLAINED[1]:
+                self.claim[partner] = theirs
+                self._note_besides(partner, theirs)
+
+    def _note_besides(self, key: Key, claim: Claim) -> None:
+        """Note what else a line holds by what was decided of its partners before it."""
+        for other in self.evidence[key].claims:
+            if _family(other.kind) != _family(claim.kind) and any(
+                partner in self.claim
+                and _family(self.claim[partner].kind) == _family(other.kind)
+                and key in self.claim[partner].partners
+                for partner in other.partners
+            ):
+                self.also.setdefault(key, other)
+
+    def _as_theirs(self, partner: Key, claim: Claim, key: Key) -> Claim | None:
+        """Return ``partner``'s own claim to be what ``key`` is by ``claim``; it names ``key``."""
+        own = [
+            c
+            for c in self.evidence[partner].claims
+            if _family(c.kind) == _family(claim.kind) and key in c.partners
+        ]
+        return max(own, key=lambda c: c.kind == ARTEFACT, default=None)
+
+
+def settled(scans: Sequence[StudiedScan], evidence: dict[Key, Evidence]) -> Settled:
+    """Settle all claims: lines of one kind first, with most partners, then the largest."""
+    done = Settled(scans, evidence)
+    while True:
+        waiting = [
+            (_urgency(done, key, claims), key, claims)
+            for key, own in evidence.items()
+            if key not in done.claim and (claims := done.open_claims(key))
+        ]
+        if not waiting:
+            return done
+        _, key, claims = max(waiting, key=lambda entry: entry[0])
+        done.settle(key, _largest(done, key, claims))
+
+
+def _urgency(done: Settled, key: Key, claims: Sequence[Claim]) -> tuple[bool, int, bool, float]:
+    kinds = {_family(c.kind) for c in claims}
+    most = max(claims, key=lambda c: len(c.partners))
+    size = done.evidence[key].line.amplitude
+    return len(kinds) == 1, len(most.partners), most.kind != VIBRATION, size
+
+
+def _largest(done: Settled, key: Key, claims: Sequence[Claim]) -> Claim:
+    """Return, of several things at one frequency, the one that is strongest where it is alone."""
+    by_kind: dict[str, list[Claim]] = {}
+    for claim in claims:
+        by_kind.setdefault(_family(claim.kind), []).append(claim)
+    sizes = {kind: size_elsewhere(done, own) for kind, own in by_kind.items()}
+    order = sorted(by_kind, key=lambda kind: -sizes[kind])
+    if len(order) > 1:
+        done.also[key] = by_kind[order[1]][0]
+    return max(by_kind[order[0]], key=lambda c: (c.kind == ARTEFACT, len(c.partners)))
+
+
+def size_elsewhere(done: Settled, claims: Sequence[Claim]) -> float:
+    """Return the greatest amplitude of the partners that nothing else explains [m]."""
+    found = [
+        done.evidence[p].line.amplitude
+        for c in claims
+        for p in c.partners
+        if p not in done.claim or _family(done.claim[p].kind) == _family(c.kind)
+    ]
+    return max(found, default=0.0)
+
+
+def _family(kind: str) -> str:
+    """Return the kind; a texture that is folded is of the same family as one that is resolved."""
+    return PART if kind == ARTEFACT else kind
+
+
+def radius_or_turn(tested: Sequence[Tested]) -> bool:
+    """Return True if a line may be rings on the part as well as the spindle, both with partners."""
+    kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.present}
+    return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)

@@ -1,1 +1,0 @@
-"""What devices deliver: blocks, counters, recordings, and where every sample went."""

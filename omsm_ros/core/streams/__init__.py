@@ -1,0 +1,1 @@
+"""Blocks of samples: counters, stamps, pairing."""

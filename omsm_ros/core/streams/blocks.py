@@ -1,0 +1,390 @@
+"""Frozen records that modules hand to each other; they mirror the wire contract.
+
+A *block* is a run of consecutive samples of one trigger counter. All quantities
+are SI; arrays are float64 of shape (n,) unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from enum import IntEnum
+from types import MappingProxyType
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import DataError
+from omsm_ros.quantities import (
+    ACCELERATION,
+    ANGLE,
+    COUNTER,
+    DISTANCE,
+    POSITION,
+    SAMPLE_PERIOD,
+    STAMP,
+    Quantity,
+)
+from omsm_ros.units import NANOSECONDS_PER_S
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+# No device here delivers more in one message; a longer block is a forgery or a wrong unit.
+MAX_BLOCK_SAMPLES = 4_000_000
+
+# Of fewer steps the median may be the jump itself.
+_STEPS_TOLD = 5
+
+SAME_PERIOD = 1e-6
+"""Sample periods are written, not measured: alike to this part, six digits, they are one."""
+
+
+# What is not plausible was not measured: it counts as lost.
+_AXES = {"x": POSITION, "y": POSITION, "z": POSITION, "b": ANGLE, "c": ANGLE}
+_DISTANCE = {"distance": DISTANCE}
+_ACCELERATION = dict.fromkeys("xyz", ACCELERATION)
+
+
+class Status(IntEnum):
+    """Verdict of the probe on one sample (values of ``DistanceBlock.status``)."""
+
+    OK = 0
+    NO_TARGET = 1
+    SATURATED = 2
+    OUT_OF_RANGE = 3
+    LOST = 4
+
+
+def no_parts() -> IntArray:
+    """Return the parts of a block of one message, (0, 2)."""
+    return np.empty((0, 2), np.int64)
+
+
+def _empty_f32() -> NDArray[np.float32]:
+    return np.empty(0, np.float32)
+
+
+def _empty_u8() -> NDArray[np.uint8]:
+    return np.empty(0, np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Block:
+    """What every block has: when and where in the trigger count it lies.
+
+    stamp_ns: time of the first sample [ns, ROS time]
+    first_sample: trigger counter of the first sample
+    sample_period: [s]
+    parts: first sample and stamp [ns] of each message it was joined of, (k, 2); empty if of one
+    """
+
+    stamp_ns: int
+    first_sample: int
+    sample_period: float
+    parts: IntArray = field(default_factory=no_parts)
+
+    def __len__(self) -> int:
+        """Samples in the block."""
+        raise NotImplementedError
+
+    @property
+    def end(self) -> int:
+        """Trigger counter after the last sample."""
+        return self.first_sample + len(self)
+
+    @property
+    def stamps(self) -> IntArray:
+        """First sample and stamp [ns] of each message that it is of, (k, 2)."""
+        return self.parts if len(self.parts) else np.array([(self.first_sample, self.stamp_ns)])
+
+    @property
+    def newest(self) -> tuple[int, int]:
+        """First sample and stamp [ns] of the last message that it is of."""
+        if not len(self.parts):
+            return self.first_sample, self.stamp_ns
+        return int(self.parts[-1, 0]), int(self.parts[-1, 1])
+
+    def _check(
+        self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
+    ) -> None:
+        if len(lengths) != 1:
+            raise DataError(
+                f"{name}: channels of different lengths {sorted(lengths)!r}, expected one; "
+                "check the driver that made it"
+            )
+        (length,) = lengths
+        if not 0 < length <= MAX_BLOCK_SAMPLES:
+            raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")
+        SAMPLE_PERIOD.checked(self.sample_period, DataError, f"{name}: sample_period")
+        COUNTER.checked(self.first_sample, DataError, f"{name}: first_sample")
+        STAMP.checked(self.stamp_ns, DataError, f"{name}: stamp")
+        for channel, quantity in channels.items():
+            object.__setattr__(self, channel, quantity.or_lost(getattr(self, channel)))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisBlock(Block):
+    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,), NaN where it was lost."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+    def __post_init__(self) -> None:
+        lengths = {len(a) for a in (self.x, self.y, self.z, self.b, self.c)}
+        self._check("AxisBlock", lengths, _AXES)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DistanceBlock(Block):
+    """Probe readings: distance [m] (n,), intensity 0-1 (n,) or (0,), status (n,) or (0,).
+
+    The distance is NaN where the status is not OK, whatever was given.
+    An empty status means that every sample is OK, an empty intensity that the
+    device does not report it.
+    """
+
+    distance: FloatArray
+    intensity: NDArray[np.float32] = field(default_factory=_empty_f32)
+    status: NDArray[np.uint8] = field(default_factory=_empty_u8)
+
+    def __post_init__(self) -> None:
+        optional = {len(a) for a in (self.intensity, self.status) if len(a)}
+        self._check("DistanceBlock", {len(self.distance)} | optional, _DISTANCE)
+        if len(self.status) and np.any(self.status != Status.OK):
+            # As the message promises, whoever sent it: a reading that is not OK is none.
+            readings = np.where(self.status == Status.OK, self.distance, np.nan)
+            object.__setattr__(self, "distance", readings)
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    @property
+    def ok(self) -> BoolArray:
+        """True where the probe gave a usable, finite reading, shape (n,)."""
+        finite = np.isfinite(self.distance)
+        return finite & (self.status == Status.OK) if len(self.status) else finite
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AccelerationBlock(Block):
+    """Acceleration x, y, z [m/s²], each of shape (n,), NaN where it was lost."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+
+    def __post_init__(self) -> None:
+        self._check("AccelerationBlock", {len(a) for a in (self.x, self.y, self.z)}, _ACCELERATION)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+class CountingOn:
+    """An angle that counts on, of one that may begin anew on every turn [rad].
+
+    Whatever delays or interpolates C would take such a jump for a turn back. A jump is told from a
+    spindle that makes a turn from sample to sample by the steps around it.
+    """
+
+    def __init__(self) -> None:
+        self._last = np.empty(0)
+        self._steps = np.empty(0)
+
+    def of(self, angle: FloatArray) -> FloatArray:
+        """Return the next angles (n,), finite; the same array where there is nothing to count."""
+        before = np.concatenate([self._last, angle])
+        steps = np.diff(before)
+        known = np.concatenate([self._steps, steps])
+        if len(known) >= _STEPS_TOLD:
+            turns = np.round((steps - np.median(known)) / (2 * np.pi))
+            if np.any(turns):
+                steps = steps - 2 * np.pi * turns
+                before[1:] -= 2 * np.pi * np.cumsum(turns)
+                angle = before[len(self._last) :]
+        self._last = before[-1:]
+        self._steps = np.concatenate([self._steps, steps])[-_STEPS_TOLD:]
+        return angle
+
+
+# Where did every sample go?
+#
+# For each stream ``received == corrected + pending + sum(counted.values())`` at any time. What
+# never came is none of these: trigger counts that a session left out are ``missing``.
+
+
+class Reason(IntEnum):
+    """Why a sample gave no surface point; 0 means that it did.
+
+    INVALID: not finite, or the probe gave no usable reading, on either side of a pair
+    UNMATCHED: the other stream has no sample of this trigger count
+    DUPLICATE: the trigger count was seen before
+    LATE: came after later samples, into a gap that had been passed
+    SETTLING: the filter had just started
+    OVERDUE: waited for its partner, or for whom its partner waited, longer than is allowed
+    BEYOND: taken where no member of the calibration set knows the dynamics
+    SLIPPED: the counters of the two streams no longer count the same triggers
+    """
+
+    NONE = 0
+    INVALID = 1
+    UNMATCHED = 2
+    DUPLICATE = 3
+    LATE = 4
+    SETTLING = 5
+    OVERDUE = 6
+    BEYOND = 7
+    SLIPPED = 8
+
+
+@dataclass(frozen=True)
+class StreamAccount:
+    """One stream: samples received, turned into points, still waiting, and counted by reason.
+
+    missing: trigger counts that never came, between the first and the last of each session
+    """
+
+    received: int = 0
+    corrected: int = 0
+    pending: int = 0
+    counted: Mapping[str, int] = field(default_factory=dict)
+    missing: int = 0
+
+
+@dataclass(frozen=True)
+class Account:
+    """Both streams of a corrector."""
+
+    axes: StreamAccount = StreamAccount()
+    distance: StreamAccount = StreamAccount()
+
+    def as_dict(self) -> dict[str, dict[str, object]]:
+        """Return JSON values: stream -> received, corrected, pending, counted {reason: samples}."""
+        return asdict(self)
+
+
+class Tally:
+    """The running account of one stream."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.missing = 0
+        self.corrected = 0
+        self._counted: Counter[Reason] = Counter()
+
+    def count(self, reason: Reason, samples: int) -> None:
+        """Enter ``samples`` under ``reason``; NONE means corrected."""
+        if reason is Reason.NONE:
+            self.corrected += samples
+        else:
+            self._counted[reason] += samples
+
+    def count_each(self, reasons: NDArray[np.uint8]) -> None:
+        """Enter one sample under each of ``reasons`` (n,)."""
+        for value, samples in enumerate(np.bincount(reasons)):
+            self.count(Reason(value), int(samples))
+
+    def snapshot(self, pending: int) -> StreamAccount:
+        """Return the account as it stands with ``pending`` samples waiting."""
+        counted = {reason.name.lower(): n for reason, n in sorted(self._counted.items()) if n}
+        return StreamAccount(self.received, self.corrected, pending, counted, self.missing)
+
+
+# Many small blocks as few large ones: a filter's call costs more than a sample.
+#
+# Whoever falls behind finds more blocks waiting, and catches up by dealing with them at once.
+
+B = TypeVar("B", AxisBlock, DistanceBlock)
+AnyBlock = TypeVar("AnyBlock", bound=Block)
+
+MOST_TOGETHER = 100
+"""Samples, as a driver's block has: each place in a queue keeps room for its longest message."""
+
+# Stamps within one block are those of its first sample and the period; they are moved no further.
+_STAMP_TOLERANCE_S = 1e-3
+_NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period", "parts")
+
+
+def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
+    """Return the blocks in runs, the count of each block following on that of the one before."""
+    runs: list[list[AnyBlock]] = []
+    for block in blocks:
+        if runs and block.first_sample == runs[-1][-1].end:
+            runs[-1].append(block)
+        else:
+            runs.append([block])
+    return runs
+
+
+def consecutive(blocks: Sequence[B]) -> list[list[B]]:
+    """Return the blocks in their order, those in one list that :func:`joined` can make one.
+
+    They have consecutive counts, one period, the same channels, and stamps that continue the
+    first one's; beyond MOST_TOGETHER samples a list has one block.
+    """
+    runs: list[list[B]] = []
+    length = 0
+    for block in blocks:
+        fits = length + len(block) <= MOST_TOGETHER
+        if runs and fits and _continues(runs[-1][0], length, block):
+            runs[-1].append(block)
+            length += len(block)
+        else:
+            runs.append([block])
+            length = len(block)
+    return runs
+
+
+def _continues(first: B, length: int, block: B) -> bool:
+    period = first.sample_period
+    if block.first_sample != first.first_sample + length or block.sample_period != period:
+        return False
+    off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
+    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _given(first) == _given(block)
+
+
+def _given(block: B) -> tuple[str, ...]:
+    """Return names of the channels that have samples: an empty one means something of its own."""
+    return tuple(name for name in _channels(block) if len(getattr(block, name)))
+
+
+def _channels(block: B) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(block) if f.name not in _NO_CHANNELS)
+
+
+def joined(run: Sequence[B]) -> B:
+    """Return one block of the samples of several that follow on, with the first one's stamp."""
+    if len(run) == 1:
+        return run[0]
+    return replace(
+        run[0],
+        **{
+            name: np.concatenate([getattr(block, name) for block in run])
+            for name in _channels(run[0])
+        },
+    )
+
+
+def without_first(block: B, messages: int) -> B:
+    """Return a block that was joined of several messages without the first of them."""
+    if not messages:
+        return block
+    first, stamp_ns = block.parts[messages].tolist()
+    start = first - block.first_sample
+    return replace(
+        block,
+        first_sample=first,
+        stamp_ns=stamp_ns,
+        parts=block.parts[messages:],
+        **{name: getattr(block, name)[start:] for name in _channels(block)},
+    )

@@ -1,0 +1,431 @@
+"""One recording of an axis and of what the probe saw, on one regular grid.
+
+Blocks of one trigger are paired by its counter. Where the rates differ there is no common
+trigger: then the axis is interpolated by the stamps, on a grid that has every sample of the
+probe on it and is at least as fine as the axis's own sampling.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import Any, Generic, TypeAlias, TypeVar
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import (
+    SAME_PERIOD,
+    AxisBlock,
+    Block,
+    BoolArray,
+    DistanceBlock,
+    FloatArray,
+    Reason,
+    StreamAccount,
+    consecutive,
+    joined,
+)
+from omsm_ros.core.streams.continuity import TIME_JUMP_S
+from omsm_ros.core.streams.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
+from omsm_ros.core.streams.stamps import axes_at_probe
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
+from omsm_ros.errors import DataError
+from omsm_ros.quantities import SAMPLE_PERIOD
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
+MAX_RECORD_SAMPLES = 20_000_000
+_LONG = f"more than {MAX_RECORD_SAMPLES} on one grid; check both sample periods"
+
+B = TypeVar("B", bound=Block)
+Values: TypeAlias = Callable[[Any], "tuple[FloatArray, BoolArray]"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionRecord:
+    """Samples of one regular grid, each array of shape (n,).
+
+    sample_period: of the grid [s]
+    z: encoder [m], finite everywhere; interpolated where it was lost, and not ``ok`` there
+    distance: probe [m], NaN where it has no reading
+    ok: True where both are measured and to be trusted
+    reference: second sensor along the same motion [m], NaN where it has no reading, or None
+    z_lost: True where z is interpolated, or None where it never is
+    by_stamps: whether two clocks, not one trigger, say which samples belong together
+    counts: what became of every sample received
+
+    Raises DataError when the arrays do not fit each other.
+    """
+
+    sample_period: float
+    z: FloatArray
+    distance: FloatArray
+    ok: BoolArray
+    reference: FloatArray | None = None
+    z_lost: BoolArray | None = None
+    by_stamps: bool = False
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        arrays = [self.z, self.distance, self.ok]
+        if self.reference is not None:
+            arrays.append(self.reference)
+        lengths = sorted({len(a) for a in arrays})
+        if len(lengths) != 1:
+            raise DataError(f"record: channels of different lengths {lengths!r}")
+        SAMPLE_PERIOD.checked(self.sample_period, DataError, "record: sample_period")
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        sample_period: float,
+        z: FloatArray,
+        distance: FloatArray,
+        ok: BoolArray | None = None,
+        reference: FloatArray | None = None,
+    ) -> MotionRecord:
+        """Return a record of plain arrays (n,); NaN in any channel marks a lost sample."""
+        z = np.asarray(z, np.float64)
+        distance = np.asarray(distance, np.float64)
+        known = np.isfinite(z)
+        usable = known & np.isfinite(distance)
+        if ok is not None:
+            usable &= ok
+        return cls(
+            sample_period=sample_period,
+            z=_filled(z, known),
+            distance=distance,
+            ok=usable,
+            reference=None if reference is None else np.asarray(reference, np.float64),
+            z_lost=None if np.all(known) else ~known,
+            counts={
+                "received": len(z),
+                "missing_axis": int(np.sum(~known)),
+                "not_ok": int(np.sum(known & ~usable)),
+                "paired": int(np.sum(usable)),
+            },
+        )
+
+
+def assemble(
+    axes: Sequence[AxisBlock],
+    distance: Sequence[DistanceBlock],
+    reference: Sequence[DistanceBlock] = (),
+    trigger: CommonTrigger = EQUAL_COUNTS,
+    by_stamps: bool = False,
+) -> MotionRecord:
+    """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
+
+    by_stamps: join them by their stamps, as those of different rates are, whatever they count
+
+    Raises DataError when nothing can be paired, when it is more than one recording, or when the
+    counters of axes and distance slipped against each other.
+    """
+    if not axes or not distance:
+        counts = f"{len(axes)} axis blocks and {len(distance)} distance blocks"
+        raise DataError(f"{counts}: both are needed; check that both topics were recorded")
+    period = _one_period("axis", axes)
+    probe_period = _one_period("distance", distance)
+    if abs(probe_period / period - 1) < SAME_PERIOD and not by_stamps:
+        return _by_counter(axes, distance, reference, period, trigger)
+    return _by_stamp(axes, distance, reference)
+
+
+def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]) -> float:
+    periods = sorted({float(block.sample_period) for block in blocks})
+    if periods[-1] > periods[0] * (1 + SAME_PERIOD):
+        raise DataError(
+            f"{name} blocks of different sample periods {periods!r} s; identify each by itself"
+        )
+    return periods[0]
+
+
+def _ordered(blocks: Iterable[B]) -> list[B]:
+    """Return blocks in the order in which they were taken, not in which they came."""
+    return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
+
+
+def _runs(blocks: Iterable[Block], values: Values, intake: Intake) -> Iterator[Run]:
+    """Yield what is new of each block; ``values`` gives its channel (n,) and where it is usable."""
+    for block in _ordered(blocks):
+        if (arrival := intake.new(block)) is not None:
+            value, ok = values(block)
+            reasons = np.where(ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
+            yield Run.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
+
+
+def _position(block: Any) -> tuple[FloatArray, BoolArray]:
+    return block.z, np.isfinite(block.z)
+
+
+def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
+    return block.distance, block.ok
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """The axis on the counts ``first`` … of one session, (n,), NaN and not ``known`` in gaps."""
+
+    runs: list[Run]
+    first: int
+    z: FloatArray
+    known: BoolArray
+    account: StreamAccount
+
+    @classmethod
+    def of(cls, axes: Sequence[AxisBlock]) -> _Grid:
+        intake = Intake()
+        runs = list(_runs(axes, _position, intake))
+        sessions = len({run.session for run in runs})
+        first, samples = runs[0].first, runs[-1].end - runs[0].first
+        if sessions > 1 or samples > MAX_RECORD_SAMPLES:
+            raise DataError(
+                f"the recording spans {samples!r} samples in {sessions!r} runs of the trigger "
+                f"counter, expected one of at most {MAX_RECORD_SAMPLES}: two recordings in one, "
+                "a counter that was reset, or a clock set back; identify from one of them"
+            )
+        z, known = np.full(samples, np.nan), np.zeros(samples, np.bool_)
+        for run in runs:
+            place = slice(run.first - first, run.end - first)
+            z[place], known[place] = run.values[0], run.reasons == Reason.NONE
+        return cls(runs, first, z, known, intake.tally.snapshot(0))
+
+    def matched(
+        self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
+    ) -> tuple[FloatArray, BoolArray, StreamAccount]:
+        """Return readings on the grid (n,), True where usable (n,), and the account of all of them.
+
+        Raises DataError where their counter slipped against that of the axes.
+        """
+        axes, intake = Intake(), Intake(trigger.counter_offset)
+        pairing = Pairing(axes, intake, trigger)
+        for run in self.runs:
+            axes.stamps.add(run.session, run.first, run.stamp_ns)
+            pairing.axes.push(run)
+        for run in _runs(blocks, _reading, intake):
+            pairing.distance.push(run)
+        seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
+        for axis, reading in chain(pairing.pairs(), pairing.end()):
+            place = slice(axis.first - self.first, axis.end - self.first)
+            usable = reading.reasons == Reason.NONE
+            seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable
+        pairing.distance.clear()
+        if pairing.watch.found is not None:
+            raise DataError(f"{name}: {pairing.watch.found}")
+        return seen, ok, intake.tally.snapshot(0)
+
+
+def _by_counter(
+    axes: Sequence[AxisBlock],
+    distance: Sequence[DistanceBlock],
+    reference: Sequence[DistanceBlock],
+    period: float,
+    trigger: CommonTrigger = EQUAL_COUNTS,
+) -> MotionRecord:
+    grid = _Grid.of(axes)
+    output, ok, account = grid.matched("distance", distance, trigger)
+    lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
+    if lost + account.counted.get("late", 0) == account.received:
+        raise DataError(
+            f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
+            f"{distance[0].first_sample} share no trigger count at the same time: record both "
+            f"at once, with stamps that differ by less than {STAMP_TOLERANCE_S} s, or, where each "
+            "counts for itself, join them by their stamps (--by-stamps)"
+        )
+    own = replace(trigger, counter_offset=0)
+    return MotionRecord(
+        sample_period=period,
+        z=_filled(grid.z, grid.known),
+        distance=output,
+        ok=grid.known & ok,
+        reference=grid.matched("reference", reference, own)[0] if reference else None,
+        z_lost=None if np.all(grid.known) else ~grid.known,
+        counts=_counts(grid, account),
+    )
+
+
+def _counts(grid: _Grid, probe: StreamAccount) -> dict[str, int]:
+    lost, axis_lost = probe.counted, grid.account.counted
+    on_grid = sum(len(run) for run in grid.runs)
+    return {
+        "received": probe.received,
+        "duplicates": lost.get("duplicate", 0) + lost.get("late", 0),
+        "axis_duplicates": axis_lost.get("duplicate", 0) + axis_lost.get("late", 0),
+        "missing_axis": len(grid.z) - on_grid,
+        "unmatched": lost.get("unmatched", 0),
+        "not_ok": lost.get("invalid", 0),
+        "paired": probe.corrected,
+    }
+
+
+def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
+    if np.all(known) or not np.any(known):
+        return np.where(known, z, 0.0)
+    index = np.arange(len(z))
+    return np.asarray(np.interp(index, index[known], z[known]))
+
+
+def _by_stamp(
+    axes: Sequence[AxisBlock],
+    distance: Sequence[DistanceBlock],
+    reference: Sequence[DistanceBlock],
+) -> MotionRecord:
+    """Join by counter, once the axis is where a trigger of the grid would have latched it."""
+    axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
+    finer = max(int(np.ceil(probe_period / axis_period - SAME_PERIOD)), 1)
+    if finer * sum(map(len, distance)) > MAX_RECORD_SAMPLES:
+        raise DataError(f"readings every {probe_period:g} s, axes every {axis_period:g} s: {_LONG}")
+    grid = [_refined(block, finer) for block in _ordered(distance)]
+    moved = list(axes_at_probe(_ordered(axes), grid))
+    second = []
+    if reference:
+        carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
+        second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
+    record = _covered(_by_counter(moved, grid, second, probe_period / finer))
+    counts = _unfilled(record.counts, distance, finer)
+    return replace(record, counts=counts, by_stamps=True)
+
+
+def _refined(block: DistanceBlock, finer: int) -> DistanceBlock:
+    """Return the block on a grid ``finer`` times as fine, its readings ``finer`` counts apart."""
+    values = np.full(len(block) * finer, np.nan)
+    values[::finer] = np.where(block.ok, block.distance, np.nan)
+    return DistanceBlock(
+        stamp_ns=block.stamp_ns,
+        first_sample=block.first_sample * finer,
+        sample_period=block.sample_period / finer,
+        distance=values,
+    )
+
+
+def _as_axis(block: DistanceBlock) -> AxisBlock:
+    zero = np.zeros(len(block))
+    return AxisBlock(
+        stamp_ns=block.stamp_ns,
+        first_sample=block.first_sample,
+        sample_period=block.sample_period,
+        x=zero,
+        y=zero,
+        z=block.distance,
+        b=zero,
+        c=zero,
+    )
+
+
+def _covered(record: MotionRecord) -> MotionRecord:
+    """Return the record from the first to the last sample at which the axis is known.
+
+    Raises DataError if there is none.
+    """
+    known = np.ones(len(record), np.bool_) if record.z_lost is None else ~record.z_lost
+    places = np.flatnonzero(known)
+    if not len(places):
+        raise DataError(
+            "the axis samples share no time with the distance stamps: they are not of one "
+            "recording, or the clocks of their senders differ; set them"
+        )
+    part = slice(int(places[0]), int(places[-1]) + 1)
+    return replace(
+        record,
+        z=record.z[part],
+        distance=record.distance[part],
+        ok=record.ok[part],
+        reference=None if record.reference is None else record.reference[part],
+        z_lost=None if np.all(known[part]) else ~known[part],
+    )
+
+
+def _unfilled(
+    counts: Mapping[str, int], distance: Sequence[DistanceBlock], finer: int
+) -> dict[str, int]:
+    """Return the account of the readings themselves, without what lies between them on the grid."""
+    received = sum(map(len, distance))
+    duplicates, unmatched = (counts[name] // finer for name in ("duplicates", "unmatched"))
+    paired = counts["paired"]
+    return dict(counts) | {
+        "received": received,
+        "duplicates": duplicates,
+        "unmatched": unmatched,
+        "not_ok": received - duplicates - unmatched - paired,
+    }
+
+
+# The last motion of the cell, kept while it happens, for an identification on request.
+
+B_MOTION_BUFFER = TypeVar("B", AxisBlock, DistanceBlock)
+
+# A block takes some 2 kB beside its samples, which is much for a block of one and little for one
+# of a hundred: that many blocks are joined as long as they hold fewer samples than that each.
+_MANY = 100
+
+
+class BlockBuffer(Generic[B_MOTION_BUFFER]):
+    """Blocks of one topic since its trigger counter last started anew, bounded in samples.
+
+    The oldest blocks go when ``capacity`` samples are exceeded; ``forgotten`` counts theirs.
+    Short blocks that follow on are joined, so that memory is that of their samples.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._blocks: deque[B_MOTION_BUFFER] = deque()
+        self._samples = 0
+        self._apart = 0  # of the newest blocks, those not joined yet
+        self.forgotten = 0
+
+    def add(self, block: B_MOTION_BUFFER) -> None:
+        """Append a block; a counter that falls back behind the last block begins a new motion.
+
+        Unless its stamp is a little older too: then the block came late, or once more.
+        """
+        if not self._blocks or block.first_sample >= self._blocks[-1].first_sample:
+            self._blocks.append(block)
+        elif 0 < self._blocks[-1].stamp_ns - block.stamp_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
+            self._blocks.insert(len(self._blocks) - 1, block)
+        else:
+            self._forget(len(self._blocks))
+            self._blocks.append(block)
+        self._samples += len(block)
+        self._apart += 1
+        if self._apart > _MANY:
+            self._join()
+        while self._samples > self._capacity and len(self._blocks) > 1:
+            self._forget(1)
+
+    def _join(self) -> None:
+        """Join short blocks but the newest, which a late one may still have to stand before."""
+        newest = self._blocks.pop()
+        blocks: list[B_MOTION_BUFFER] = [self._blocks.pop() for _ in range(self._apart - 1)][::-1]
+        if sum(map(len, blocks)) < _MANY * len(blocks):
+            blocks = [joined(run) for run in consecutive(blocks)]
+        self._blocks.extend(blocks)
+        self._blocks.append(newest)
+        self._apart = 1
+
+    def forget(self) -> None:
+        """Forget all blocks: what comes does not belong to them."""
+        self._forget(len(self._blocks))
+
+    def _forget(self, blocks: int) -> None:
+        for _ in range(blocks):
+            samples = len(self._blocks.popleft())
+            self._samples -= samples
+            self.forgotten += samples
+        self._apart = min(self._apart, len(self._blocks))
+
+    def __len__(self) -> int:
+        """Samples held."""
+        return self._samples
+
+    def recent(self, duration: float = 0.0) -> list[B_MOTION_BUFFER]:
+        """Return blocks that reach into the last ``duration`` seconds of the motion; 0 = all."""
+        if not self._blocks or duration == 0:
+            return list(self._blocks)
+        last = self._blocks[-1]
+        first = last.end - duration / last.sample_period
+        return [b for b in self._blocks if b.end > first]

@@ -1,0 +1,347 @@
+"""Which samples of two streams belong to one trigger?
+
+Both streams are queues in the order of their sessions and trigger counts. Their heads are
+compared: equal counts of the same session make pairs, and a head that the other stream has
+already passed will never find its partner. Every decision rests on the two heads alone,
+so the outcome does not depend on how the streams were interleaved or cut.
+
+Sessions are counted by each stream for itself. The first pair with the same count *and* the
+same time links a session of one stream to a session of the other. From then on their stamps
+are watched: pairs whose counts slipped against each other are none.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import Block, FloatArray, Reason, Tally
+from omsm_ros.core.streams.continuity import Arrival, StampLine, TriggerCount
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
+STAMP_TOLERANCE_S = 0.5
+# So many runs in a row that do not fit end the look for those that do.
+_MISSES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Consecutive samples of one stream.
+
+    session, first: of the first sample;  stamp_ns, period_ns: its time and the step [ns]
+    reasons: why a sample cannot become a point, Reason, (n,)
+    values: the stream's channels, (channels, n)
+    """
+
+    session: int
+    first: int
+    stamp_ns: int
+    period_ns: float
+    reasons: NDArray[np.uint8]
+    values: FloatArray
+
+    @classmethod
+    def of(
+        cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
+    ) -> Run:
+        """Return what is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
+        period_ns = _period_ns(block)
+        whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
+        return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
+
+    def __len__(self) -> int:
+        return len(self.reasons)
+
+    @property
+    def end(self) -> int:
+        """The count after the last sample."""
+        return self.first + len(self)
+
+    def stamp_of(self, count: int) -> float:
+        """Return the time of the sample ``count`` [ns]."""
+        return self.stamp_ns + (count - self.first) * self.period_ns
+
+    def part(self, start: int, stop: int) -> Run:
+        """Return the samples from index ``start`` up to ``stop``."""
+        return Run(
+            self.session,
+            self.first + start,
+            self.stamp_ns + round(start * self.period_ns),
+            self.period_ns,
+            self.reasons[start:stop],
+            self.values[:, start:stop],
+        )
+
+
+class Intake:
+    """One stream's blocks on their way to a partner: what is new of each, what is counted.
+
+    offset: added to the stream's trigger counts;  stamps: of its blocks
+    """
+
+    def __init__(self, offset: int = 0) -> None:
+        self.tally = Tally()
+        self.stamps = StampLine()
+        self._offset = offset
+        self._count = TriggerCount()
+
+    def new(self, block: Block, parts: Sequence[Block] = ()) -> Arrival | None:
+        """Count the samples of ``block``; None if all were there before, or came too late.
+
+        parts: the blocks it was joined of, each with a stamp of its own
+        """
+        arrival = self._count.place(block, len(block))
+        self.tally.received += len(block)
+        self.tally.missing = max(self.tally.missing + arrival.missing - arrival.late, 0)
+        self.tally.count(Reason.LATE, arrival.late)
+        self.tally.count(Reason.DUPLICATE, arrival.skip - arrival.late)
+        if arrival.skip == len(block):
+            return None
+        arrival = replace(arrival, first=arrival.first + self._offset)
+        for part in parts or (block,):
+            self._note(part, arrival)
+        return arrival
+
+    def _note(self, block: Block, arrival: Arrival) -> None:
+        """Keep the stamps of what is new of ``block``."""
+        begins, period_ns = arrival.first + arrival.skip, _period_ns(block)
+        if not len(block.parts):
+            first = block.first_sample + self._offset
+            late = max(begins - first, 0)
+            if late < len(block):
+                stamp_ns = block.stamp_ns + round(late * period_ns)
+                self.stamps.add(arrival.session, first + late, stamp_ns)
+            return
+        firsts, stamps = block.parts.T
+        firsts = firsts + self._offset
+        new = np.append(firsts[1:], block.end + self._offset) > begins
+        skipped = np.maximum(begins - firsts[new], 0)
+        stamps = stamps[new] + np.rint(skipped * period_ns).astype(np.int64)
+        self.stamps.extend(arrival.session, firsts[new] + skipped, stamps)
+
+    def end(self) -> None:
+        """Begin a session with whatever comes next."""
+        self._count.end()
+
+
+class Queue:
+    """Runs of one stream that wait for a partner.
+
+    pending: samples without one;  held: in pairs that are not settled yet
+    given_up: the newest samples that waited too long
+    stamps: of the blocks they came in
+    """
+
+    def __init__(self, tally: Tally, stamps: StampLine) -> None:
+        self.stamps = stamps
+        self.pending = self.held = 0
+        self.given_up: Run | None = None
+        self._runs: deque[Run] = deque()
+        self._tally = tally
+
+    @property
+    def head(self) -> Run | None:
+        """The oldest run."""
+        return self._runs[0] if self._runs else None
+
+    def push(self, run: Run) -> None:
+        """Append the newest run."""
+        self._runs.append(run)
+        self.pending += len(run)
+
+    def drop(self, samples: int, reason: Reason = Reason.UNMATCHED) -> Run:
+        """Take the oldest ``samples`` of the head, which have no partner for ``reason``."""
+        run = self._cut(samples)
+        self.stamps.advance(run.session, run.end - 1)
+        self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
+        return run
+
+    def hold(self, samples: int) -> Run:
+        """Take the oldest ``samples`` of the head, which have partners; settle or refuse them."""
+        self.held += samples
+        return self._cut(samples)
+
+    def settle(self, run: Run, partner_reasons: NDArray[np.uint8]) -> None:
+        """Enter a run that was held, whose partners have these reasons."""
+        self.held -= len(run)
+        if run.reasons.any() or partner_reasons.any():
+            self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
+        else:
+            self._tally.count(Reason.NONE, len(run))
+
+    def refuse(self, run: Run) -> None:
+        """Enter a run that was held, and whose partners are of other triggers."""
+        self.held -= len(run)
+        self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(Reason.SLIPPED)))
+
+    def limit(self, samples: int) -> None:
+        """Give the oldest up until no more than ``samples`` wait."""
+        while self.pending > samples:
+            excess = min(self.pending - samples, len(self._runs[0]))
+            self.given_up = self.drop(excess, Reason.OVERDUE)
+
+    def clear(self) -> None:
+        """Drop all that waits, which will find no partner."""
+        while self._runs:
+            self.drop(len(self._runs[0]))
+
+    def strays(self, other: Run) -> int:
+        """Return how many runs come before the newest ones of ``other``'s time; 0 without such."""
+        first = misses = 0
+        for place in range(len(self._runs) - 1, 0, -1):
+            misses = misses + 1 if _apart(self._runs[place], other) else 0
+            if misses == _MISSES:
+                break
+            first = first if misses else place
+        return first
+
+    def _cut(self, samples: int) -> Run:
+        run = self._runs[0]
+        self.pending -= samples
+        if samples == len(run):
+            return self._runs.popleft()
+        self._runs[0] = run.part(samples, len(run))
+        return run.part(0, samples)
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """A session of the axes, and the session of the distance that counts the same triggers."""
+
+    axes: int
+    distance: int
+
+
+class Pairing:
+    """Joins the two queues.
+
+    stamp_skew: time of the axes less time of the distance at the newest common count [s]
+    """
+
+    def __init__(
+        self, axes: Intake, distance: Intake, trigger: CommonTrigger = EQUAL_COUNTS
+    ) -> None:
+        self.axes = Queue(axes.tally, axes.stamps)
+        self.distance = Queue(distance.tally, distance.stamps)
+        self.stamp_skew: float | None = None
+        self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
+        self._link = _Link(-1, -1)
+        self._held: deque[tuple[Run, Run]] = deque()
+
+    def pairs(self) -> Iterator[tuple[Run, Run]]:
+        """Yield complete runs of axes and distance, of equal count and length."""
+        while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
+            order = self._order(a, d)
+            if order == 0:
+                yield from self._joined(a, d)
+            elif not self._linked(a, d) and _apart(a, d) and self._passes_strays(a, d):
+                continue
+            elif order < 0:
+                samples = self._leading(a, d.first, a, d)
+                self.axes.drop(samples, _missing(a, self.distance))
+            else:
+                samples = self._leading(d, a.first, a, d)
+                self.distance.drop(samples, _missing(d, self.axes))
+
+    def end(self) -> Iterator[tuple[Run, Run]]:
+        """Yield the pairs that still wait to be settled, as far as stamps can tell; none follow."""
+        if self._held:
+            yield from self._settle(self._held[-1][0].end, self.watch.end())
+
+    def _joined(self, a: Run, d: Run) -> Iterator[tuple[Run, Run]]:
+        """Yield the pairs that two heads of equal count settle; theirs may have to wait."""
+        self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
+        sessions, first, samples = (a.session, d.session), a.first, min(len(a), len(d))
+        if sessions != self.watch.sessions:
+            yield from self.end()
+        self._held.append((self.axes.hold(samples), self.distance.hold(samples)))
+        verdicts = self.watch.settled(sessions, first, first + samples, a.period_ns)
+        # Pairs with one verdict are one run, however many stamps it rests on.
+        for slipped, alike in groupby(verdicts, key=itemgetter(1)):
+            yield from self._settle(max(until for until, _ in alike), slipped)
+
+    def _settle(self, until: int, slipped: bool) -> Iterator[tuple[Run, Run]]:
+        """Yield the pairs that waited before the count ``until``, but for those that slipped."""
+        while self._held and (first := self._held[0][0].first) < until:
+            a, d = self._held.popleft()
+            if until < a.end:
+                stop = until - first
+                self._held.appendleft((a.part(stop, len(a)), d.part(stop, len(d))))
+                a, d = a.part(0, stop), d.part(0, stop)
+            if slipped:
+                self.axes.refuse(a)
+                self.distance.refuse(d)
+            else:
+                self.axes.settle(a, d.reasons)
+                self.distance.settle(d, a.reasons)
+                yield a, d
+
+    def _passes_strays(self, a: Run, d: Run) -> bool:
+        """Drop heads of a wrong time, where the other stream's goes with what comes after them.
+
+        Of a block whose stamp was wrong alone, nothing says so but the blocks that follow it: one
+        head would be taken for older, and the other stream dropped from then on.
+        """
+        axes, distance = self.axes.strays(d), self.distance.strays(a)
+        if bool(axes) == bool(distance):
+            return False
+        stream = self.axes if axes else self.distance
+        for _ in range(axes or distance):
+            assert stream.head is not None
+            stream.drop(len(stream.head))
+        return True
+
+    def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
+        """Return samples of ``run`` before the other head, all of them if the sessions differ."""
+        if not self._linked(a, d):
+            return len(run)
+        return min(other_first - run.first, len(run))
+
+    def _linked(self, a: Run, d: Run) -> bool:
+        return (a.session, d.session) == (self._link.axes, self._link.distance)
+
+    def _order(self, a: Run, d: Run) -> int:
+        """Return -1 if the axes' head has no partner, 1 if the distance's, 0 for a pair."""
+        if not self._linked(a, d):
+            if _apart(a, d):
+                return self._older(a, d)
+            if max(a.first, d.first) < min(a.end, d.end):
+                self._link = _Link(a.session, d.session)
+        return _sign(a.first - d.first)
+
+    def _older(self, a: Run, d: Run) -> int:
+        """Return which of two heads that cannot be of one session is left over from before."""
+        if a.session == self._link.axes:
+            return -1
+        if d.session == self._link.distance:
+            return 1
+        return _sign(a.stamp_ns - d.stamp_ns) or -1
+
+
+def _apart(a: Run, d: Run) -> bool:
+    """Return True if one trigger count would have had two different times."""
+    count = max(a.first, d.first)
+    return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
+
+
+def _missing(run: Run, other: Queue) -> Reason:
+    """Return why the other stream has no partner for the first sample of ``run``."""
+    lost = other.given_up
+    overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
+    return Reason.OVERDUE if overdue else Reason.UNMATCHED
+
+
+def _period_ns(block: Block) -> float:
+    return block.sample_period * NANOSECONDS_PER_S
+
+
+def _sign(value: float) -> int:
+    return (value > 0) - (value < 0)

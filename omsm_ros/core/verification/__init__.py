@@ -1,1 +1,0 @@
-"""Is a calibration true? Free paths, reversal, change, repeatability."""

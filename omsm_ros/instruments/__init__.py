@@ -1,0 +1,1 @@
+"""Probes, encoders and sensors: protocol, device and emulator of each."""

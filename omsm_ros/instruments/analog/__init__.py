@@ -1,0 +1,1 @@
+"""Analog sensors behind a data acquisition device."""

@@ -1,0 +1,365 @@
+"""Analog sensors through a converter, to blocks: an accelerometer, a capacitive probe."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+from urllib.parse import parse_qs
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import AccelerationBlock, Block, DistanceBlock, FloatArray, Status
+from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.instruments.blocks import BlockPair, DeviceClock
+from omsm_ros.instruments.transport import parts_of
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Voltages of an analog-to-digital converter: National Instruments', or a synthetic one.
+
+# The driver's buffer holds ten seconds: longer than any pause of a healthy host.
+_BUFFER_S = 10.0
+# NI-DAQmx: samples were overwritten before they were read.
+_OVERWRITTEN = (-200279, -200278)
+
+
+class AnalogInput(Protocol):
+    """Several channels sampled together and evenly.
+
+    name: for messages
+    """
+
+    @property
+    def name(self) -> str:
+        """Return what the input is called in messages."""
+        ...
+
+    def open(self, rate: float) -> None:
+        """Begin to sample at ``rate`` [Hz]; raises DeviceError."""
+
+    def read(self, timeout: float) -> FloatArray:
+        """Return what was sampled since, (n, channels) [V], waiting up to ``timeout`` [s].
+
+        Raises DeviceError where samples were lost or the converter is gone.
+        """
+
+    def close(self) -> None:
+        """Stop; does nothing when not open."""
+
+
+class NidaqInput:
+    """``daq://Dev1/ai0:2?range=10&clock=PFI0``: by NI's own driver and its Python package.
+
+    range: largest voltage [V];  clock: terminal of an external sample clock, such as the probe's
+    trigger; the converter's own without. Imported where it is opened; untried on hardware.
+    """
+
+    def __init__(self, address: str, channels: int) -> None:
+        """Raise ConfigurationError for an address that is none."""
+        parts = parts_of(address)
+        query = {name: values[0] for name, values in parse_qs(parts.query).items()}
+        if not parts.netloc or len(parts.path) < 2 or set(query) - {"range", "clock"}:
+            raise ConfigurationError(
+                f"address {address!r}, expected daq://Dev1/ai0:{channels - 1}?range=10&clock=PFI0"
+            )
+        self.name = address
+        self._channels = channels
+        self._lines = f"{parts.netloc}{parts.path}"
+        self._clock = query.get("clock", "")
+        try:
+            self._range = float(query.get("range", "10"))
+        except ValueError as err:
+            raise ConfigurationError(f"address {address!r}: range is no number of volts") from err
+        if not 0 < self._range <= 1000:
+            raise ConfigurationError(f"address {address!r}: range beyond 0 to 1000 V")
+        self._task: Any = None
+
+    def open(self, rate: float) -> None:
+        """Begin to sample at ``rate`` [Hz]; raises DeviceError."""
+        self.close()
+        nidaqmx = _nidaqmx()
+        try:
+            self._task = nidaqmx.Task()
+            self._task.ai_channels.add_ai_voltage_chan(
+                self._lines, min_val=-self._range, max_val=self._range
+            )
+            self._task.timing.cfg_samp_clk_timing(
+                rate,
+                source=self._clock,
+                sample_mode=nidaqmx.constants.AcquisitionType.CONTINUOUS,
+                samps_per_chan=int(rate * _BUFFER_S) + 1,
+            )
+            found = float(self._task.timing.samp_clk_rate)
+            count = int(self._task.number_of_channels)
+            self._task.start()
+        except nidaqmx.errors.Error as err:
+            self.close()
+            raise DeviceError(
+                f"{self.name} cannot be read: {' '.join(str(err).split())[:300]}; check the "
+                "device's name in NI MAX or nilsdev, and its channels"
+            ) from err
+        if count != self._channels:
+            self.close()
+            raise DeviceError(f"{self.name} has {count} channels, expected {self._channels}")
+        if not self._clock and abs(found / rate - 1) > 1e-3:
+            self.close()
+            raise DeviceError(
+                f"{self.name} samples at {found:.6g} Hz where {rate:.6g} Hz was asked for; set "
+                f"sample_period to {1 / found:.9g} s"
+            )
+
+    def read(self, timeout: float) -> FloatArray:
+        """Return what was sampled since, (n, channels) [V]; raises DeviceError."""
+        if self._task is None:
+            raise DeviceError(f"{self.name} is not open")
+        nidaqmx = _nidaqmx()
+        try:
+            waiting = int(self._task.in_stream.avail_samp_per_chan)
+            if not waiting:
+                time.sleep(min(timeout, 0.02))
+                waiting = int(self._task.in_stream.avail_samp_per_chan)
+            if not waiting:
+                return np.empty((0, self._channels))
+            values = self._task.read(number_of_samples_per_channel=waiting, timeout=timeout + 1.0)
+        except nidaqmx.errors.Error as err:
+            lost = getattr(err, "error_code", 0) in _OVERWRITTEN
+            reason = "samples were overwritten before they were read" if lost else str(err)
+            raise DeviceError(
+                f"{self.name}: {' '.join(reason.split())[:300]}; check cable, power and the "
+                "computer's load"
+            ) from err
+        return np.asarray(values, np.float64).reshape(self._channels, -1).T.copy()
+
+    def close(self) -> None:
+        """Stop; does nothing when not open."""
+        if self._task is not None:
+            task, self._task = self._task, None
+            task.close()
+
+
+class SyntheticInput:
+    """``synthetic://?frequency=680&amplitude=0.01&noise=0.001``: a sine on noise, in volts.
+
+    On each channel a quarter of a turn later. For trials without a converter: it samples the host's
+    monotonic clock, so that its rate is true.
+    """
+
+    def __init__(
+        self, address: str, channels: int, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Raise ConfigurationError for an address that is none."""
+        parts = parts_of(address)
+        query = {name: values[0] for name, values in parse_qs(parts.query).items()}
+        values = {"frequency": 100.0, "amplitude": 0.01, "noise": 1e-4}
+        if set(query) - set(values) or parts.netloc:
+            raise ConfigurationError(
+                f"address {address!r}, expected synthetic://?frequency=680&amplitude=0.01&noise=1e-3"
+            )
+        try:
+            values |= {name: float(text) for name, text in query.items()}
+        except ValueError as err:
+            raise ConfigurationError(f"address {address!r}: {err}") from err
+        if not all(np.isfinite(v) and 0 <= v < 1e6 for v in values.values()):
+            raise ConfigurationError(f"address {address!r}: values beyond 0 to 1e6")
+        self.name = address
+        self._values, self._channels, self._monotonic = values, channels, monotonic
+        self._random = np.random.default_rng(1)
+        self._rate = self._start = 0.0
+        self._taken = -1
+
+    def open(self, rate: float) -> None:
+        """Begin at ``rate`` [Hz]."""
+        self._rate, self._start, self._taken = rate, self._monotonic(), 0
+
+    def read(self, timeout: float) -> FloatArray:
+        """Return what a converter would have sampled since, (n, channels) [V]."""
+        if self._taken < 0:
+            raise DeviceError(f"{self.name} is not open")
+        due = int((self._monotonic() - self._start) * self._rate)
+        if due == self._taken:
+            time.sleep(min(timeout, 0.02))
+            due = int((self._monotonic() - self._start) * self._rate)
+        when = np.arange(self._taken, due) / self._rate
+        self._taken = due
+        quarter = np.arange(self._channels) * np.pi / 2
+        phase = 2 * np.pi * self._values["frequency"] * when[:, np.newaxis] - quarter
+        noise = self._random.normal(0.0, self._values["noise"] or 0.0, phase.shape)
+        return np.asarray(self._values["amplitude"] * np.sin(phase) + noise)
+
+    def close(self) -> None:
+        """Stop."""
+        self._taken = -1
+
+
+def analog_input(address: str, channels: int) -> AnalogInput:
+    """Return the input that ``address`` names (``daq://``, ``synthetic://``), not yet open.
+
+    Raises ConfigurationError.
+    """
+    scheme = parts_of(address).scheme
+    if scheme == "daq":
+        return NidaqInput(address, channels)
+    if scheme == "synthetic":
+        return SyntheticInput(address, channels)
+    raise ConfigurationError(f"address {address!r}, expected daq://Dev1/ai0 or synthetic://")
+
+
+def _nidaqmx() -> Any:
+    try:
+        import nidaqmx
+        import nidaqmx.constants
+    except ImportError as err:
+        raise DeviceError("daq:// needs nidaqmx: pip install nidaqmx") from err
+    return nidaqmx
+
+
+STANDARD_GRAVITY = 9.80665
+"""[m/s²], exact by definition."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnalogSettings:
+    """sample_period: [s];  block_size: samples in a block."""
+
+    sample_period: float
+    block_size: int
+
+
+class AnalogDevice:
+    """Samples a converter that runs freely and cuts what it gives into blocks.
+
+    The converter numbers nothing, so samples are counted here; after a loss the count goes on by
+    the time that passed, and the difference is ``lost``. A kind of sensor fills in ``_block``.
+    """
+
+    def __init__(
+        self,
+        source: AnalogInput,
+        settings: AnalogSettings,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """now_ns: the host clock that stamps refer to [ns];  monotonic: for the time lost [s]."""
+        self._source, self._settings = source, settings
+        self._now_ns, self._monotonic = now_ns, monotonic
+        self._clock = DeviceClock()
+        self._waiting: FloatArray = np.empty((0, 0))
+        self._first = self._decoded = self._delivered = self._lost = self._gaps = 0
+        self._heard = 0.0
+
+    def open(self) -> None:
+        """Begin to sample; raises DeviceError."""
+        self._source.open(1.0 / self._settings.sample_period)
+        now = self._monotonic()
+        if self._decoded:
+            missed = max(round((now - self._heard) / self._settings.sample_period), 0)
+            self._lost += missed
+            self._gaps += missed > 0
+            self._first += missed
+        self._heard = now
+
+    def poll(self, timeout: float) -> list[Any]:
+        """Return blocks completed by what comes within ``timeout`` [s]; raises DeviceError."""
+        volts = self._source.read(timeout)
+        if not len(volts):
+            return []
+        self._heard = self._monotonic()
+        self._decoded += len(volts)
+        waiting = self._waiting if len(self._waiting) else volts[:0]
+        self._waiting = np.concatenate([waiting, volts])
+        newest = self._first + len(self._waiting) - 1
+        self._clock.observe(self._device_ns(newest), self._now_ns())
+        blocks = []
+        while len(self._waiting) >= self._settings.block_size:
+            blocks.append(self._take(self._settings.block_size))
+        return blocks
+
+    def close(self) -> list[Any]:
+        """Stop and return the partial block, if any."""
+        blocks = [self._take(len(self._waiting))] if len(self._waiting) else []
+        self._source.close()
+        return blocks
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """A converter knows nothing of its sensor."""
+        return {}
+
+    @property
+    def trouble(self) -> str:
+        """Return why the samples cannot be used; they always can."""
+        return ""
+
+    def counts(self) -> dict[str, float]:
+        """Return what became of every sample: ``decoded = delivered + pending``; lost, gaps."""
+        return {
+            "decoded": self._decoded,
+            "delivered": self._delivered,
+            "pending": len(self._waiting),
+            "lost": self._lost,
+            "gaps": self._gaps,
+        }
+
+    def _device_ns(self, number: int) -> int:
+        return round(number * self._settings.sample_period * NANOSECONDS_PER_S)
+
+    def _take(self, count: int) -> Any:
+        volts, self._waiting = self._waiting[:count], self._waiting[count:]
+        stamp = self._clock.to_host(self._device_ns(self._first))
+        common = {
+            "stamp_ns": stamp,
+            "first_sample": self._first,
+            "sample_period": self._settings.sample_period,
+        }
+        self._first += count
+        self._delivered += count
+        return self._block(volts, common)
+
+    def _block(self, volts: FloatArray, common: dict[str, Any]) -> Block | BlockPair:
+        """Return the block of ``volts`` (n, channels) [V]."""
+        raise NotImplementedError
+
+
+class Accelerometer(AnalogDevice):
+    """Three axes; it cannot see 0 Hz if it is an IEPE sensor, and its offset is not removed."""
+
+    def __init__(
+        self, source: AnalogInput, settings: AnalogSettings, sensitivity: float, **clocks: Any
+    ) -> None:
+        """sensitivity: [V/(m/s²)]; the paper's PCB 356A17 has 0.5 V/g."""
+        super().__init__(source, settings, **clocks)
+        self._sensitivity = sensitivity
+
+    def _block(self, volts: FloatArray, common: dict[str, Any]) -> AccelerationBlock:
+        x, y, z = np.ascontiguousarray(volts.T / self._sensitivity)
+        return AccelerationBlock(**common, x=x, y=y, z=z)
+
+
+class AnalogReference(AnalogDevice):
+    """A displacement sensor with a voltage; beyond its range it measures no distance."""
+
+    def __init__(
+        self,
+        source: AnalogInput,
+        settings: AnalogSettings,
+        *,
+        sensitivity: float,
+        full_scale: float,
+        polarity: int = 1,
+        zero: float = 0.0,
+        **clocks: Any,
+    ) -> None:
+        """sensitivity: [V/m], the paper's CPL190 has 80 mV/µm;  full_scale: range, from 0 V [m]
+        polarity: +1 if the reading falls as z rises;  zero: reading that is distance zero [m]
+        """
+        super().__init__(source, settings, **clocks)
+        self._sensitivity, self._full_scale = sensitivity, full_scale
+        self._polarity, self._zero = polarity, zero
+
+    def _block(self, volts: FloatArray, common: dict[str, Any]) -> BlockPair:
+        reading = volts[:, 0] / self._sensitivity
+        outside = ~((reading >= 0) & (reading <= self._full_scale))
+        distance = np.where(outside, np.nan, self._polarity * (reading - self._zero))
+        status = np.where(outside, Status.OUT_OF_RANGE, Status.OK).astype(np.uint8)
+        return BlockPair(None, DistanceBlock(**common, distance=distance, status=status))

@@ -1,0 +1,374 @@
+"""Runs of samples → blocks, stamped on the host's clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import (
+    MAX_BLOCK_SAMPLES,
+    AxisBlock,
+    DistanceBlock,
+    FloatArray,
+    IntArray,
+)
+from omsm_ros.core.streams.statistics import spread
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.instruments.counting import SAMPLE, Run, Samples, Turns
+from omsm_ros.instruments.six_channel.protocol import AXES, AxisScaling
+from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
+
+# Device time → host time, by a line through all arrivals of the last half minute.
+#
+# What arrives, arrives late and unevenly; what the device counts is even. So host time is
+# fitted as ``offset + (1 + drift) · device time``: robustly, since some arrivals are very late,
+# and over a window, since crystals change with temperature.
+
+# Long enough to average jitter out, short enough to follow a crystal that warms up [s].
+WINDOW_S = 30.0
+# Arrivals closer than this count as one, their mean: it bounds the fit to 1500 points [s].
+_BIN_S = 0.02
+# Crystals differ by some tens of ppm; it holds the drift until arrivals show it.
+_DRIFT_SIGMA = 100 * PPM
+# A drift beyond this, by five of its own uncertainties, is no crystal: a device that is played
+# faster than it was recorded, or set to another rate.
+_NO_CRYSTAL = 1000 * PPM
+# Arrivals off the line by more than this, all to one side, for so long: a clock was set [s].
+_STEP_S, _STEP_AFTER_S = 0.02, 2.0
+# Nothing arrives before it was sent: what is earlier than the line by more than a busy host may
+# have held up its first arrivals is a sign of a clock that was set, at once [s].
+_EARLY_S = 1.0
+# And no sample is kept back for longer than this before it is sent [s].
+_OLDEST_S = 3600.0
+# A drift is told from so many seconds of arrivals on.
+_TELLING_S = 5.0
+# One of a tenth and more, another rate, shows sooner: arrivals uneven by 20 ms tell it to 0.01.
+_GROSS, _GROSS_TELLING_S = 0.1, 1.0
+# Huber's constant: 95 % efficient for normal jitter; uniform jitter is not clipped at all.
+_HUBER = 1.5
+_ITERATIONS = 5
+_LEAST_SCALE_S = 1e-6
+
+
+class DeviceClock:
+    """Stamps that neither jump nor bunch, and rise strictly whatever the arrivals do.
+
+    A clock that was set, the device's or the host's, is followed after two seconds, and at once
+    if arrivals then come earlier than they can.
+    """
+
+    def __init__(self) -> None:
+        self._last_stamp: int | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all arrivals: the device's clock started anew. Stamps still only rise."""
+        # Bins: sums of device time and of delay after the origin [s], and how many.
+        self._bins: deque[tuple[float, float, int]] = deque()
+        self._origin = self._newest = (0, 0)
+        self._offset = self._slope = 0.0
+        self._span = 0.0
+        self._fitted_at = -np.inf
+        # To which side arrivals have been off, and since when [device, arrival; s].
+        self._astray: tuple[bool, float, float] | None = None
+
+    @property
+    def drift(self) -> float | None:
+        """Host seconds per device second, less one; None before it is known."""
+        patience = _GROSS_TELLING_S if abs(self._slope) > _GROSS else _TELLING_S
+        return self._slope if self._span >= patience else None
+
+    def observe(self, device_ns: int, arrival_ns: int) -> None:
+        """Note that a sample taken at ``device_ns`` was at the host at ``arrival_ns``.
+
+        Of samples that arrive together, the last says most and is enough.
+        """
+        if not self._bins:
+            self._origin = (device_ns, arrival_ns)
+        device = (device_ns - self._origin[0]) * NANOSECOND_S
+        late = (arrival_ns - self._origin[1]) * NANOSECOND_S - device
+        if self._stepped(device, late):
+            self.restart()
+            self.observe(device_ns, arrival_ns)
+            return
+        self._newest = (device_ns, arrival_ns)
+        self._keep(device, late)
+        if len(self._bins) < 50 or device - self._fitted_at > 0.1 or device < self._fitted_at:
+            self._fit()
+            self._fitted_at = device
+
+    def to_host(self, device_ns: int) -> int:
+        """Return the host time [ns] of ``device_ns``, later than every stamp given before.
+
+        A time that no sample can have which arrived with the newest is not believed.
+        """
+        if not self._bins:
+            raise ConfigurationError("DeviceClock.to_host before any arrival; call observe() first")
+        age = (self._newest[0] - device_ns) * NANOSECOND_S
+        if not -_EARLY_S < age < _OLDEST_S:
+            device_ns = self._newest[0]
+        since = device_ns - self._origin[0]
+        late = self._offset + self._slope * (since * NANOSECOND_S)
+        stamp = self._origin[1] + since + round(late * NANOSECONDS_PER_S)
+        if self._last_stamp is not None:
+            stamp = max(stamp, self._last_stamp + 1)
+        self._last_stamp = stamp
+        return stamp
+
+    def _keep(self, device: float, late: float) -> None:
+        """Add to the last bin, or begin one; forget what the window has left behind."""
+        if self._bins:
+            total, delay, count = self._bins[-1]
+            if 0 <= device - total / count < _BIN_S:
+                self._bins[-1] = (total + device, delay + late, count + 1)
+                return
+        self._bins.append((device, late, 1))
+        while device + late - _arrival(self._bins[0]) > WINDOW_S:
+            self._bins.popleft()
+
+    def _stepped(self, device: float, late: float) -> bool:
+        """Return whether arrivals have been off the line, to one side, for too long or too far."""
+        off = late - (self._offset + self._slope * device)
+        if self._bins and not -_EARLY_S < off < _OLDEST_S:
+            return True
+        side, arrival = bool(off > 0), device + late
+        if not self._bins or abs(off) < _STEP_S:
+            self._astray = None
+        elif self._astray is None or self._astray[0] != side:
+            self._astray = (side, device, arrival)
+        if self._astray is None:
+            return False
+        _, since, arrived = self._astray
+        return min(device - since, arrival - arrived) > _STEP_AFTER_S
+
+    def _fit(self) -> None:
+        """Fit Huber's line through the bins, the drift held by what crystals do."""
+        bins = np.array(self._bins)
+        count = bins[:, 2]
+        device, late = bins[:, 0] / count, bins[:, 1] / count
+        self._span = float(np.ptp(device))
+        # About the middle, offset and drift do not disturb each other.
+        middle = float(device.mean())
+        free = _line(device - middle, late, count, np.inf)
+        beyond = abs(free[1]) - 5 * free[2] > _NO_CRYSTAL and len(count) > 5
+        offset, slope, _ = free if beyond else _line(device - middle, late, count, _DRIFT_SIGMA)
+        self._slope = slope
+        self._offset = offset - slope * middle
+
+
+def _arrival(item: tuple[float, float, int]) -> float:
+    return (item[0] + item[1]) / item[2]
+
+
+def _line(
+    x: FloatArray, y: FloatArray, count: FloatArray, sigma: float
+) -> tuple[float, float, float]:
+    """Return offset, slope and its uncertainty of a robust line; sigma: of the slope beforehand."""
+    offset, slope = float(np.median(y)), 0.0
+    weight, scale = count, _LEAST_SCALE_S
+    uncertainty = np.inf
+    for _ in range(_ITERATIONS):
+        residual = y - offset - slope * x
+        scale = max(_LEAST_SCALE_S, spread(residual))
+        weight = count * np.minimum(1.0, _HUBER * scale / np.maximum(abs(residual), 1e-12))
+        total = weight.sum()
+        mx, my = float((weight * x).sum() / total), float((weight * y).sum() / total)
+        held = (scale / sigma) ** 2
+        power = float((weight * (x - mx) ** 2).sum()) + held
+        slope = float((weight * (x - mx) * (y - my)).sum()) / power if power > 0 else 0.0
+        offset = my - slope * mx
+        uncertainty = scale / np.sqrt(power) if power > 0 else np.inf
+    return offset, slope, float(uncertainty)
+
+
+# More than crystals differ by: beyond it the nominal period is wrong.
+PERIOD_TOLERANCE = 100 * PPM
+# A device that runs freely at another rate than this is set to another rate.
+RATE_TOLERANCE = 1000 * PPM
+# So is one that tells no time, if its samples arrive at another rate than this.
+ARRIVAL_TOLERANCE = 5000 * PPM
+
+
+class BlockPair(NamedTuple):
+    """What one run of a device's samples becomes; None where it has no such channels."""
+
+    axes: AxisBlock | None
+    distance: DistanceBlock | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockSettings:
+    """sample_period: nominal [s];  block_size: samples;  pause: a partial block is handed over
+    when nothing came for so long [s];  renew: a connection that is silent for so long is made
+    anew, which costs a sample or two if it was well [s]; 0 = never;  free_running: the device
+    keeps the period itself, so a block at another rate is withheld.
+    """
+
+    sample_period: float = 1e-3
+    block_size: int = 100
+    pause: float = 0.2
+    renew: float = 0.0
+    free_running: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("sample_period", "pause"):
+            value = getattr(self, name)
+            if not 0 < value < np.inf:
+                raise ConfigurationError(f"{name} {value!r} s, expected a positive number")
+        if not 0 < self.block_size <= MAX_BLOCK_SAMPLES:
+            raise ConfigurationError(
+                f"block_size {self.block_size!r}, expected 1 to {MAX_BLOCK_SAMPLES}"
+            )
+
+
+class Channels(NamedTuple):
+    """What a device measures. distance: a probe;  axes: how its encoders count, in the order of
+    AXES, or None;  timed: its samples carry its own time.
+    """
+
+    distance: bool = True
+    axes: tuple[AxisScaling, ...] | None = None
+    timed: bool = True
+
+
+def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
+    """Return the axes; their encoders wrap after ``counts`` where nothing else is said."""
+    if axes is None:
+        return None
+    return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
+
+
+class BlockCutter:
+    """Runs → pairs of blocks of ``block_size`` samples; a gap or a restart closes one early.
+
+    delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
+    period_deviation: from nominal, relative: of the last full block's device time, or of the
+    arrivals of a device that reports no time
+    period_warnings: full blocks beyond PERIOD_TOLERANCE
+    """
+
+    def __init__(self, settings: BlockSettings, channels: Channels) -> None:
+        self._settings = settings
+        self._channels = channels
+        self._clock = DeviceClock()
+        self._pending: Samples = np.empty(0, SAMPLE)
+        self._first = self._stamp = 0
+        self._turns = [Turns(axis.wrap) for axis in channels.axes or ()]
+        self.delivered = self.withheld = self.blocks = self.period_warnings = 0
+        self.period_deviation = 0.0
+
+    @property
+    def pending(self) -> int:
+        """Samples that wait for their block to fill."""
+        return len(self._pending)
+
+    @property
+    def wrong_rate(self) -> bool:
+        """Whether the device runs freely, but not at the rate it was set to."""
+        limit = RATE_TOLERANCE if self._channels.timed else ARRIVAL_TOLERANCE
+        return self._settings.free_running and abs(self.period_deviation) > limit
+
+    def add(
+        self, runs: Sequence[Run], arrival_ns: int, *, after_silence: bool = False
+    ) -> Iterator[BlockPair]:
+        """Yield the blocks completed by ``runs``, which arrived together at ``arrival_ns``."""
+        for i, run in enumerate(runs):
+            if run.restarted or run.first_sample != self._first + self.pending:
+                yield from self.flush()
+                self._first = run.first_sample
+            if i == 0 or run.restarted:
+                self._set_clock(runs[i:], arrival_ns, after_silence and i == 0)
+            yield from self._append(run)
+
+    def _set_clock(self, runs: Sequence[Run], arrival_ns: int, after_silence: bool) -> None:
+        """Tell the clock of the last sample that arrived before the device started anew."""
+        continuous = self._channels.timed or self._settings.free_running
+        if runs[0].restarted or (after_silence and not continuous):
+            self._clock.restart()
+        anew = (i for i, run in enumerate(runs) if i and run.restarted)
+        last = runs[next(anew, len(runs)) - 1]
+        self._clock.observe(int(self._times(last)[-1]), arrival_ns)
+
+    def _append(self, run: Run) -> Iterator[BlockPair]:
+        samples = run.samples.copy()
+        samples["time"] = self._times(run)
+        if not self.pending:
+            self._stamp = self._clock.to_host(int(samples["time"][0]))
+        self._pending = np.concatenate([self._pending, samples])
+        while self.pending >= self._settings.block_size:
+            yield from self._take(self._settings.block_size)
+
+    def flush(self) -> Iterator[BlockPair]:
+        """Yield the partial block, if any."""
+        if self.pending:
+            yield from self._take(self.pending)
+
+    def _times(self, run: Run) -> IntArray:
+        """Return the device time [ns] of each sample: its own, or its count times the period."""
+        times: IntArray = run.samples["time"]
+        if not self._channels.timed:
+            counts = run.first_sample + np.arange(len(run.samples))
+            period_ns = self._settings.sample_period * NANOSECONDS_PER_S
+            times = np.rint(counts * period_ns).astype(np.int64)
+        return times
+
+    def _take(self, count: int) -> Iterator[BlockPair]:
+        samples, self._pending = self._pending[:count], self._pending[count:]
+        first, self._first = self._first, self._first + count
+        stamp = self._stamp
+        if self.pending:
+            self._stamp = self._clock.to_host(int(self._pending["time"][0]))
+        self._check_period(samples)
+        if self.wrong_rate:
+            self.withheld += count
+            return
+        self.delivered += count
+        self.blocks += 1
+        yield self._blocks(samples, first, stamp)
+
+    def _check_period(self, samples: Samples) -> None:
+        if not self._channels.timed:
+            self.period_deviation = self._clock.drift or 0.0
+            return
+        periods = len(samples) - 1
+        if periods < max(1, self._settings.block_size - 1):
+            return  # too short to tell a wrong period from jitter
+        nominal = periods * self._settings.sample_period
+        elapsed = (int(samples["time"][-1]) - int(samples["time"][0])) * NANOSECOND_S
+        self.period_deviation = elapsed / nominal - 1
+        self.period_warnings += abs(self.period_deviation) > PERIOD_TOLERANCE
+
+    def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:
+        common = {
+            "stamp_ns": stamp,
+            "first_sample": first,
+            "sample_period": self._settings.sample_period,
+        }
+        axes = distance = None
+        if self._channels.axes is not None:
+            axes = AxisBlock(**common, **self._positions(samples, self._channels.axes))  # type: ignore[arg-type]
+        if self._channels.distance:
+            reported = not np.isnan(samples["intensity"]).all()
+            distance = DistanceBlock(
+                **common,  # type: ignore[arg-type]
+                distance=samples["distance"],
+                status=samples["status"],
+                intensity=samples["intensity"] if reported else np.empty(0, np.float32),
+            )
+        return BlockPair(axes, distance)
+
+    def _positions(
+        self, samples: Samples, scaling: tuple[AxisScaling, ...]
+    ) -> dict[str, FloatArray]:
+        turned = [
+            turns.continued(counts)
+            for turns, counts in zip(self._turns, samples["counts"].T[: len(scaling)], strict=True)
+        ]
+        return {
+            name: axis.values(column)
+            for name, axis, column in zip(AXES, scaling, turned, strict=True)
+        }

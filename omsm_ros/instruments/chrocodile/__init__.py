@@ -1,0 +1,1 @@
+"""Precitec CHRocodile."""

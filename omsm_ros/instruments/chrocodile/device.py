@@ -1,0 +1,479 @@
+"""Precitec CHRocodile: what the drivers of both its protocols have in common.
+
+Untried on hardware. What the public facts leave open is a setting or is read tolerantly.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import IntArray
+from omsm_ros.errors import (
+    ConfigurationError,
+    DeviceError,
+    DeviceTimeoutError,
+    NoSamplesError,
+    ProtocolError,
+)
+from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockPair, BlockSettings, Channels, wrapping
+from omsm_ros.instruments.chrocodile.protocol import (
+    QUERY,
+    Answer,
+    BinaryDecoder,
+    DollarStream,
+    LineDecoder,
+    command,
+)
+from omsm_ros.instruments.chrocodile.telegram import (
+    DISTANCE,
+    ENCODER_RANGE,
+    FLAGS,
+    INTENSITY,
+    LATCHES,
+    SAMPLE_COUNTER,
+    START_TIME,
+    SYNC,
+    TRIGGER_DELAYED,
+    TRIGGER_LOST,
+    Layout,
+    ProbeReading,
+    Records,
+    check_selection,
+    counts_of,
+    distance_of,
+)
+from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
+from omsm_ros.instruments.six_channel.protocol import AxisScaling
+from omsm_ros.instruments.stream import StreamDevice
+from omsm_ros.instruments.transport import Transport
+from omsm_ros.units import MICROMETRE_M, NANOSECONDS_PER_S
+
+TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
+FORMATS = {"binary": "BIN", "ascii": "ASC"}
+# In `TRE` the device's own rate must be just above that of the trigger.
+_ABOVE_TRIGGER = 1.05
+# Settings that a calibration belongs to; the lamp's is how long it shines within an exposure.
+_DECISIVE = {
+    "model": "model", "SEN": "head", "SHZ": "rate", "AVD": "averaging", "LAI": "lamp",
+    "SCA": "full_scale",
+}  # fmt: skip
+_COUNTER_RANGE = 2**16
+# How far a rate may be from a whole multiple of another [relative].
+_MULTIPLE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChrocodileSettings(BlockSettings):
+    """How the device is set up and read; None leaves as it is what the device has.
+
+    signals: numbers for `$SODX`; empty = counter, time, flags, distance, intensity, encoders
+    axes: scaling of the encoders on X, Y, Z, B, C; None = it has none
+    encoders: which of the device's encoders X Y Z U V (0 to 4) is on each axis
+    latch: of the encoders at the exposure's "start", "end" or their "mean"
+    trigger: "free_run", "each", "once" or "window";  format: "binary" or "ascii"
+    lamp: 0-100;  averaging: samples;  threshold: of detection;  head: sensor head 0-15
+    sync: the device's sync bytes
+    patience: for an answer, and for samples of a device that runs freely [s]
+    """
+
+    signals: tuple[int, ...] = ()
+    axes: tuple[AxisScaling, ...] | None = None
+    encoders: tuple[int, ...] = (0, 1, 2, 3, 4)
+    latch: str = "start"
+    trigger: str = "free_run"
+    format: str = "binary"
+    lamp: float | None = None
+    averaging: int | None = None
+    threshold: float | None = None
+    head: int | None = None
+    sync: bytes = SYNC
+    probe: ProbeReading = field(default_factory=ProbeReading)
+    patience: float = 2.0
+
+    def __post_init__(self) -> None:
+        BlockSettings.__post_init__(self)
+        for name, choice in (("trigger", TRIGGERS), ("format", FORMATS), ("latch", LATCHES)):
+            if getattr(self, name) not in choice:
+                raise ConfigurationError(
+                    f"{name} {getattr(self, name)!r}, expected one of {sorted(choice)}"
+                )
+        if sorted(self.encoders) != [0, 1, 2, 3, 4]:
+            raise ConfigurationError(f"encoders {self.encoders!r}, expected 0 to 4, each once")
+        if self.signals:
+            check_selection(self.signals, self.latched)
+
+    @property
+    def latched(self) -> tuple[int, ...]:
+        """Signals that the axes are read from."""
+        return sum(LATCHES[self.latch], ()) if self.axes is not None else ()
+
+
+class RefusedError(DeviceError):
+    """The device answered that it does not have the command, or not with this value."""
+
+
+class Chrocodile(StreamDevice):
+    """Sets the device up, reads back what was set, and turns its signals into samples.
+
+    triggers_lost, triggers_delayed: samples the device flagged so
+    """
+
+    # What is asked for when no signals are given.
+    usual: tuple[int, ...] = (SAMPLE_COUNTER, FLAGS, DISTANCE, INTENSITY)
+    always_timed = False
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ChrocodileSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        settings = settings or ChrocodileSettings()
+        free = settings.trigger == "free_run"
+        selection = settings.signals or (*self.usual, *settings.latched)
+        timed = self.always_timed or START_TIME in selection
+        period = settings.sample_period if free else 0.0
+        super().__init__(
+            transport,
+            replace(settings, free_running=free),
+            Channels(axes=wrapping(settings.axes, ENCODER_RANGE), timed=timed),
+            Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period),
+            now_ns,
+            monotonic,
+        )
+        self.triggers_lost = self.triggers_delayed = 0
+        self._wanted = settings
+        self._selection = self._signals = selection
+        self._probe = settings.probe
+        self._identity: dict[str, str] = {}
+        self._asked = 0.0
+        self._ever_set_up = False
+        self._exposures = 1  # that the device averages into a sample
+        self._slowed_by_averaging = True
+        self._unheard = False  # it answered, but no telegram could be read
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Return what the device reported of itself and its settings."""
+        return self._identity
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """Return what moves a reading in time, or makes it another: model, head, rate, lamp …"""
+        identity = self._identity
+        reported = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
+        if not reported:
+            return {}
+        return reported | {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        flags = {"triggers_lost": self.triggers_lost, "triggers_delayed": self.triggers_delayed}
+        return super().counts() | flags
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """Return what came, as any device; one averaging at the same rate is set up anew."""
+        blocks = super().poll(timeout)
+        self._unheard &= not blocks
+        faster = (1 + self._cutter.period_deviation) * self._exposures
+        if self._exposures > 1 and self._cutter.wrong_rate and abs(faster - 1) < _MULTIPLE:
+            self._slowed_by_averaging = False
+            raise DeviceError(
+                f"{self._transport.name} averages {self._exposures} exposures and sends no fewer "
+                "samples; it is set up anew for that"
+            )
+        return blocks
+
+    def dark_reference(self) -> None:
+        """Take the dark reference: no target may be in range. It lasts about three seconds."""
+        self._ask("DRK", patience=self._wanted.patience + 8.0)
+
+    # What a protocol fills in.
+
+    def _begin(self) -> None:
+        """Make the device listen; raises DeviceError."""
+
+    def _finish(self) -> None:
+        """Make the device send what was selected; raises DeviceError."""
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        """Return the answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
+        raise NotImplementedError
+
+    # Setting up.
+
+    def _prepare(self) -> None:
+        wanted = self._wanted
+        self._begin()
+        self._identity = {"model": _version(self._try("VER").text)}
+        intact = self._ever_set_up and self._selected()
+        if wanted.head is not None:
+            self._set("SEN", wanted.head)
+        self._set("SODX", *self._selection)
+        if wanted.averaging is not None:
+            self._set("AVD", wanted.averaging)
+        self._read("AVD")
+        self._set_rate()
+        for name, value in (("LAI", wanted.lamp), ("THR", wanted.threshold)):
+            if value is not None:
+                self._set(name, value)
+        self._read_scale()
+        for name in ("SEN", "LAI"):
+            self._read(name)
+        if not intact:
+            self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
+            self._tracker.begin_anew()
+        self._ever_set_up = True
+        self._finish()
+        self._asked = self._monotonic()
+
+    def _try(self, name: str, *arguments: str | float) -> Answer:
+        """Return the answer to a command that not every model has; an empty one if refused."""
+        try:
+            return self._ask(name, *arguments)
+        except RefusedError:
+            return Answer(b"", "")
+
+    def _read(self, name: str) -> None:
+        """Enter a setting that was left as it is; not every model reports it."""
+        if name not in self._identity and (found := self._try(name, QUERY).numbers):
+            self._identity[name] = " ".join(f"{number:g}" for number in found)
+
+    def _set(self, name: str, *values: float) -> None:
+        """Set and read back; DeviceError if the device has other values then."""
+        self._ask(name, *values)
+        found = self._ask(name, QUERY).numbers
+        self._identity[name] = " ".join(f"{number:g}" for number in found)
+        if found and not _agree(found, values, within=0.0 if name == "SODX" else 1e-3):
+            raise DeviceError(
+                f"{self._transport.name}: ${name} was set to {values!r}, the device has {found!r}; "
+                "choose a value that it accepts"
+            )
+
+    def _set_rate(self) -> None:
+        """SHZ counts exposures: as many to a sample, or to a trigger, as are averaged into it."""
+        told = _value(self._identity.get("AVD", "1"))
+        averaged = isinstance(told, float) and told > 1 and self._slowed_by_averaging
+        self._exposures = round(told) if averaged and isinstance(told, float) else 1
+        rate = self._exposures / self._wanted.sample_period
+        free = self._wanted.trigger == "free_run"
+        self._ask("SHZ", rate if free else float(round(rate * _ABOVE_TRIGGER)))
+        found = self._ask("SHZ", QUERY).numbers
+        if not found:
+            return
+        self._identity["SHZ"] = f"{found[0]:g}"
+        if free and abs(found[0] / rate - 1) > RATE_TOLERANCE / 2:
+            raise DeviceError(
+                f"{self._transport.name}: {rate:.6g} Hz was asked for, the device measures at "
+                f"{found[0]:.6g} Hz; set sample_period to {self._exposures / found[0]:.9g} s"
+            )
+        if not free and found[0] < rate:
+            raise DeviceError(
+                f"{self._transport.name}: its {found[0]:.6g} Hz are below the trigger's "
+                f"{rate:.6g} Hz, so triggers would be lost; shorten exposure or averaging"
+            )
+
+    def _read_scale(self) -> None:
+        found = self._try("SCA", QUERY).numbers
+        if found and found[0] > 0:
+            self._probe = replace(self._wanted.probe, full_scale=found[0] * MICROMETRE_M)
+            self._identity["SCA"] = f"{found[0]:g}"
+
+    def _unanswered(self, name: str, said: bytes) -> DeviceTimeoutError:
+        if said:
+            hint = f"it sends {said[-32:]!r}: another baud rate, or no CHRocodile is there"
+        else:
+            hint = (
+                "check power, cable, and that this is the device's port: by TCP 7890 (packets "
+                "7891), on a serial line at the right baud rate, 115200 by default"
+            )
+        return DeviceTimeoutError(f"{self._transport.name} did not answer {name!r}; {hint}")
+
+    # Reading.
+
+    def _listen_in(self, silent: float) -> None:
+        """Ask a silent device whether it is still set up; a device that runs freely must talk."""
+        now = self._monotonic()
+        if min(silent, now - self._asked) < self._wanted.patience:
+            return
+        self._asked = now
+        if not self._selected():
+            raise DeviceError(
+                f"{self._transport.name} lost its settings (a restart?); it is set up anew"
+            )
+        if self._wanted.trigger == "free_run":
+            self._unheard = True
+            raise NoSamplesError(
+                f"{self._transport.name} answers, but sent no telegram that could be read for "
+                f"{silent:.1f} s; check its trigger, and that no other program sets it up"
+            )
+
+    def _selected(self) -> bool:
+        """Return whether the device still has our selection; one that was restarted has its own."""
+        found = self._ask("SODX", QUERY).numbers
+        return not found or set(self._selection) <= set(found)
+
+    def _converted(self, batches: Sequence[Records]) -> Samples:
+        parts = [self._convert(records) for records in batches if len(records)]
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _convert(self, records: Records) -> Samples:
+        samples = np.zeros(len(records), SAMPLE)
+        samples["counter"] = records[str(SAMPLE_COUNTER)]
+        found = distance_of(records, self._signals, self._probe)
+        samples["distance"], samples["intensity"], samples["status"] = found
+        if self.channels.axes is not None:
+            samples["counts"] = counts_of(records, self._wanted.latch, self._wanted.encoders)
+        if FLAGS in self._signals:
+            flags = records[str(FLAGS)].astype(np.int64)
+            self.triggers_lost += int(np.sum((flags & TRIGGER_LOST) > 0))
+            self.triggers_delayed += int(np.sum((flags & TRIGGER_DELAYED) > 0))
+        return samples
+
+
+def _version(text: str) -> str:
+    """The answer to VER; some devices answer it with words of refusal."""
+    return text if any(map(str.isdigit, text)) else "CHRocodile"
+
+
+def _value(text: str) -> object:
+    """Return a number, where the text is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bool:
+    """Return whether an answer holds the values set, within a share of each; more may follow."""
+    if within == 0:
+        return set(wanted) <= set(found)  # in the device's own order
+    return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)
+
+
+# A CHRocodile in the dollar protocol, over a serial line or TCP.
+
+_TIME_RANGE = 2**32
+# Start bit, eight data bits, stop bit.
+_BITS_PER_BYTE = 10
+
+
+class ChrocodileDevice(Chrocodile):
+    """Reads telegrams, in the layout that the device describes."""
+
+    usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ChrocodileSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(transport, settings, now_ns, monotonic)
+        self._stream = DollarStream()
+        self._early: list[Records] = []
+        self._raw_time: int | None = None
+        self._device_ns = 0
+        self._time_at = 0.0
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        decoder = self._stream.decoder
+        return super().counts() | (asdict(decoder.statistics) if decoder is not None else {})
+
+    def _begin(self) -> None:
+        self._stream.start()
+        self._early.clear()
+        self._ask("STO")
+        if self._unheard:
+            # Somebody may have set another sync sequence; its bytes follow the command at once.
+            self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
+
+    def _finish(self) -> None:
+        self._ask(FORMATS[self._wanted.format])
+        layout = self._layout()
+        self._check_line(layout)
+        binary = self._wanted.format == "binary"
+        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
+        self._ask("STA")
+
+    def _layout(self) -> Layout:
+        """Return the layout that the device describes, or the table's where it does not."""
+        answer = self._ask("DTF")
+        try:
+            layout = Layout.described(answer.text, self._wanted.sync)
+        except ProtocolError:
+            layout = Layout.of(self._selection, self._wanted.sync)
+        if missing := set(self._selection) - set(layout.signals):
+            raise DeviceError(
+                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
+                f"sends {layout.signals!r} ($DTF {answer.text!r}); choose signals that it has"
+            )
+        self._signals = layout.signals
+        return layout
+
+    def _check_line(self, layout: Layout) -> None:
+        baud_rate = getattr(self._transport, "baud_rate", None)
+        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
+        if baud_rate is not None and needed > baud_rate:
+            raise DeviceError(
+                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
+                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
+            )
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        """Return the answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
+        return self._exchange(command(name, *arguments), patience)
+
+    def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
+        self._stream.expect(wire)
+        self._transport.write(wire)
+        deadline = self._monotonic() + (patience or self._wanted.patience)
+        unanswered = partial(self._unanswered, wire.decode("latin-1").strip())
+        while True:
+            data = self._read_answer(self._stream.last_outside, unanswered)
+            self._early += self._stream.feed(data)
+            if not data:
+                self._stream.settle_answer()
+            answer = self._stream.take_answer()
+            if answer is not None:
+                return answer
+            if self._monotonic() > deadline:
+                raise unanswered(self._stream.last_outside)
+
+    def _decode(self, data: bytes) -> Samples:
+        early, self._early = self._early, []
+        return self._converted(early + self._stream.feed(data))
+
+    def _ahead(self) -> float:
+        """A telegram counts when the next one has begun, so it had come a sample before."""
+        decoder = self._stream.decoder
+        binary = isinstance(decoder, BinaryDecoder)
+        return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
+
+    def _rest(self) -> Samples:
+        return self._converted(self._stream.settle())
+
+    def _convert(self, records: Records) -> Samples:
+        samples = super()._convert(records)
+        if START_TIME in self._signals:
+            samples["time"] = self._unwrap(records[str(START_TIME)].astype(np.int64))
+        return samples
+
+    def _unwrap(self, raw: IntArray) -> IntArray:
+        """Return device time [ns] that does not wrap; turns in a silence by the host's clock."""
+        now = self._monotonic()
+        previous = self._raw_time if self._raw_time is not None else int(raw[0])
+        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
+        hidden = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
+        steps[0] += max(0, round(hidden / _TIME_RANGE)) * _TIME_RANGE
+        times: IntArray = self._device_ns + np.cumsum(steps)
+        self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
+        return times

@@ -1,0 +1,289 @@
+"""A CHRocodile in the dollar protocol, fed by the twin.
+
+Imitated: commands with echo, answer and ``ready``, telegrams in both formats, mixed byte
+order, the selection of signals and its description, rounding of rates, counters that wrap,
+invalid samples as distance and intensity zero, encoders of 32 bits, settings that a power
+cycle loses, and the faults of ``Instrument``.
+
+Not imitated: optics, exposure and averaging (an averaging is only remembered), the dark
+reference, upload of tables, a baud rate that is changed, samples measured during an answer.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import Status
+from omsm_ros.instruments.chrocodile.packet_protocol import (
+    CONFIGURED,
+    ERROR,
+    FORMATS,
+    TIME_OFFSET,
+    UPDATE,
+    Command,
+    DataFormat,
+    PacketDecoder,
+    Value,
+    encode_command,
+    encode_data,
+    encode_format,
+)
+from omsm_ros.instruments.chrocodile.packet_protocol import QUERY as CHROCODILE_PACKET_QUERY
+from omsm_ros.instruments.chrocodile.protocol import QUERY, Request, RequestParser, answer_wire
+from omsm_ros.instruments.chrocodile.protocol import QUERY as ASK
+from omsm_ros.instruments.chrocodile.telegram import (
+    DISTANCE,
+    DISTANCE_16,
+    DISTANCE_NM,
+    ENCODERS_AT_END,
+    ENCODERS_AT_START,
+    FLAGS,
+    INTENSITY,
+    INTENSITY_16,
+    S32,
+    SAMPLE_COUNTER,
+    SATURATED,
+    SIGNALS,
+    START_TIME,
+    SYNC,
+    Layout,
+    ProbeReading,
+    Records,
+)
+from omsm_ros.instruments.emulator import AXES, Instrument, Line, Measured, Source
+from omsm_ros.instruments.six_channel.protocol import AxisScaling
+from omsm_ros.units import MICROMETRE_M
+
+# The device measures in whole steps of this [s], so rates are rounded.
+_EXPOSURE_STEP_S = 1e-7
+_VERSION = "CHRocodile 2 emulated"
+
+# One turn is 2^28 counts: 32 bits hold 16 whole turns, so nothing is lost when they wrap.
+LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
+ROTARY = AxisScaling(counts_per_unit=2**28 / (2 * np.pi), wrap=2**32)
+AXIS_SCALING = (LINEAR, LINEAR, LINEAR, ROTARY, ROTARY)
+
+
+class ChrocodileEmulator(Instrument):
+    """The device's side of the dollar protocol."""
+
+    counter_range = 2**16
+
+    def __init__(
+        self,
+        line: Line,
+        source: Source | None = None,
+        *,
+        triggered: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        seed: int = 1,
+        probe: ProbeReading | None = None,
+        axes: tuple[AxisScaling, ...] = AXIS_SCALING,
+        sync: bytes = SYNC,
+    ) -> None:
+        self._probe = probe or ProbeReading()
+        self._axes = axes
+        self._sync = sync
+        self._requests = RequestParser()
+        super().__init__(line, source, triggered=triggered, clock=clock, seed=seed)
+
+    def reset(self) -> None:
+        """Go back to the factory's settings: ASCII, distance and intensity, 1 kHz, free running."""
+        self._requests = RequestParser()
+        self._values = {"SHZ": "1000", "LAI": "100", "AVD": "1", "THR": "10", "SEN": "0"}
+        self._values["SODX"] = f"{DISTANCE} {INTENSITY}"
+        self._layout = Layout.of((DISTANCE, INTENSITY), self._sync)
+        self._binary = False
+        self._started_stream = True
+
+    def rate(self) -> float:
+        """Return samples per second as set."""
+        if self._triggered:
+            return super().rate()
+        return float(self._values["SHZ"]) / max(1.0, float(self._values["AVD"]))
+
+    def streaming(self) -> bool:
+        """Return whether samples are to be sent."""
+        return self._started_stream
+
+    # Commands.
+
+    def receive(self, data: bytes) -> None:
+        """Take commands, in any portions."""
+        for request in self._requests.feed(data):
+            self.say(answer_wire(request.wire, self._answer(request)))
+
+    def _answer(self, request: Request) -> str:
+        name, arguments = request.name, request.arguments
+        if name in ("STA", "STO"):
+            self._started_stream = name == "STA"
+            return ""
+        if name == "SSQ":
+            self._sync = request.wire[4:6]
+            self._layout = Layout.of(self._layout.signals, self._sync)
+            return ""
+        if name in ("BIN", "ASC"):
+            self._binary = name == "BIN"
+            return ""
+        if name in ("TRE", "TRG"):
+            self.reset_counter()
+            return ""
+        if name in ("CTN", "TRW", "STR", "DRK", "NOP"):
+            return ""
+        fixed = {
+            "VER": _VERSION,
+            "DTF": self._layout.describe(),
+            "SCA": f"{self._probe.full_scale / MICROMETRE_M:.0f}",
+        }
+        if name in fixed:
+            return fixed[name]
+        if arguments == (QUERY,):
+            return self._values.get(name, "not valid")
+        return self._set(name, arguments)
+
+    def _set(self, name: str, arguments: tuple[str, ...]) -> str:
+        if name not in self._values or not arguments:
+            return "not valid"
+        if name == "SODX":
+            try:
+                numbers = tuple(int(word) for word in arguments)
+                self._layout = Layout.of(numbers, self._sync)
+            except ValueError:
+                return "not valid"
+        if name == "SHZ":
+            period = max(1, round(1 / float(arguments[0]) / _EXPOSURE_STEP_S)) * _EXPOSURE_STEP_S
+            arguments = (f"{1 / period:.8g}",)
+        self._values[name] = " ".join(arguments)
+        return ""
+
+    # Telegrams.
+
+    def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        """Return the wire bytes of each sample."""
+        records = self._layout.records(len(measured))
+        for number in self._layout.signals:
+            column = self._signal(number, measured, counters, times_ns)
+            records[str(number)] = column
+        if not self._binary:
+            return self._layout.lines(records)
+        return _pieces(records)
+
+    def _signal(
+        self, number: int, measured: Measured, counters: np.ndarray, times_ns: np.ndarray
+    ) -> np.ndarray:
+        nothing = measured.status == Status.NO_TARGET
+        if number in (DISTANCE, DISTANCE_NM, DISTANCE_16):
+            raw = self._probe.raw(measured.distance) / self._probe.unit(number)
+            sent = np.where(nothing | np.isnan(raw), 0.0, raw)
+            return sent if number == DISTANCE else np.clip(np.rint(sent), -(2**31), 2**31 - 1)
+        if number in (INTENSITY, INTENSITY_16):
+            light = measured.intensity * self._probe.intensity_full_scale
+            return np.where(nothing, 0.0, np.rint(light) if number == INTENSITY_16 else light)
+        if number in ENCODERS_AT_START or number in ENCODERS_AT_END:
+            index = (number - ENCODERS_AT_START[0]) % len(AXES)
+            counts = self._axes[index].counts(measured.axes[AXES[index]])
+            return (counts + 2**31) % 2**32 - 2**31
+        if number == START_TIME:
+            return times_ns % 2**32
+        if number == FLAGS:
+            return np.where(measured.status == Status.SATURATED, SATURATED, 0)
+        if number == SAMPLE_COUNTER:
+            return counters
+        return np.zeros(len(measured))
+
+
+def _pieces(records: Records) -> list[bytes]:
+    wire, size = records.tobytes(), records.dtype.itemsize
+    return [wire[i : i + size] for i in range(0, len(wire), size)]
+
+
+# A CHRocodile 2 in the packet protocol, fed by the twin.
+#
+# Imitated beside what ``ChrocodileEmulator`` does: updates and ``CONF`` upon connecting, tickets,
+# refusals, data formats with their counter, signals in another order than they were selected,
+# packets of many samples with the device's time, and the time offset of triggered samples.
+#
+# Not imitated: several streams, channels and clients, spectra, transfer of tables.
+
+# Samples in a packet: a device that sent each alone would waste its line.
+_SAMPLES = 64
+_REFUSED = "not valid"
+
+
+class ChrocodilePacketEmulator(ChrocodileEmulator):
+    """The device's side of the packet protocol; it sends from the moment it is switched on."""
+
+    def reset(self) -> None:
+        """Go back to the settings after switching on."""
+        super().reset()
+        self._packets = PacketDecoder()
+        self._format_counter = 0
+        self._describe()
+
+    def greet(self) -> None:
+        """Tell a new client everything, ``CONF`` last."""
+        self._packets.reset()
+        for name in ("SHZ", "LAI", "AVD", "SODX"):
+            values = tuple(map(_number, self._values[name].split()))
+            self.say(encode_command(Command(name, values, UPDATE)))
+        self.say(encode_format(self._format))
+        self.say(encode_command(Command(CONFIGURED, (), UPDATE)))
+
+    def receive(self, data: bytes) -> None:
+        """Take commands, in any portions."""
+        for message in self._packets.feed(data):
+            if isinstance(message, Command):
+                self._obey(message)
+
+    def _obey(self, asked: Command) -> None:
+        words = (ASK,) if asked.flags & CHROCODILE_PACKET_QUERY else tuple(map(_text, asked.values))
+        text = self._answer(Request(b"", asked.name, words))
+        flags = ERROR if text == _REFUSED else 0
+        if asked.name == "VER" or flags:
+            values: tuple[Value, ...] = (text,)
+        else:
+            values = tuple(map(_number, text.split())) if text else asked.values
+        self.say(encode_command(Command(asked.name, values, flags, asked.ticket)))
+        if asked.name in ("SODX", "SHZ") and not asked.flags & CHROCODILE_PACKET_QUERY:
+            self._describe()
+            self.say(encode_format(self._format))
+
+    def _describe(self) -> None:
+        """Announce a new data format; its order is the device's own."""
+        self._format_counter += 1
+        numbers = sorted(self._layout.signals)
+        signals = tuple((n, SIGNALS[n].type, 1) for n in numbers)
+        if self._triggered:
+            signals = ((TIME_OFFSET, S32, 1), *signals)
+        self._format = DataFormat(self._format_counter, self.rate(), signals)
+
+    def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        """Return packets in the places of their first samples."""
+        records = np.zeros(len(measured), self._format.dtype)
+        pieces = [b""] * len(measured)
+        for number, kind, _ in self._format.signals:
+            if number != TIME_OFFSET:
+                column = self._signal(number, measured, counters, times_ns)
+                records[str(number)] = np.asarray(column).astype(FORMATS[kind])
+        for start in range(0, len(records), _SAMPLES):
+            part = slice(start, start + _SAMPLES)
+            if self._triggered:
+                late = (times_ns[part] - times_ns[start]) * 2**32 // 10**9
+                records[str(TIME_OFFSET)][part] = late
+            wire = encode_data(self._format, records[part], int(times_ns[start]))
+            pieces[start] = wire
+        return pieces
+
+
+def _number(word: str) -> Value:
+    try:
+        return int(word)
+    except ValueError:
+        return float(word)
+
+
+def _text(value: Value) -> str:
+    return value if isinstance(value, str) else f"{value:.9g}"

@@ -1,0 +1,164 @@
+"""A CHRocodile 2 in the packet protocol, over TCP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+
+import numpy as np
+
+from omsm_ros.errors import DeviceError, DeviceTimeoutError
+from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileSettings, RefusedError
+from omsm_ros.instruments.chrocodile.packet_protocol import (
+    CONFIGURED,
+    DATA_BODY,
+    ERROR,
+    HEADER,
+    QUERY,
+    UPDATE,
+    Command,
+    Data,
+    Message,
+    PacketDecoder,
+    Value,
+    encode_command,
+)
+from omsm_ros.instruments.chrocodile.protocol import Answer
+from omsm_ros.instruments.counting import SAMPLE, Samples
+from omsm_ros.instruments.transport import Transport
+
+_TICKETS = 2**16
+
+
+class ChrocodilePacketDevice(Chrocodile):
+    """Reads packets; the device's own time, in every packet, is that of the samples."""
+
+    always_timed = True
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ChrocodileSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(transport, settings, now_ns, monotonic)
+        self._decoder = PacketDecoder()
+        self._ticket, self._sample_bytes = 0, 1
+        self._early: list[Data] = []
+        self._commands: list[Command] = []
+        self._said = b""
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    def _begin(self) -> None:
+        """Wait until the device has reported its whole configuration."""
+        self._decoder.reset()
+        self._early.clear()
+        self._commands.clear()
+        self._said = b""
+        self._await_configuration()
+        self._try("STO")
+
+    def _await_configuration(self) -> None:
+        """The device tells it to every new client; one that has not is asked for it once."""
+        told = self._wanted.patience / 2
+        try:
+            self._await("CONF", lambda c: c.name == CONFIGURED, told)
+        except DeviceTimeoutError:
+            self._transport.write(encode_command(Command(CONFIGURED, (), 0, 0)))
+            self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
+
+    def _finish(self) -> None:
+        self._early.clear()  # measured before the device was set up
+        self._try("STA")
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        self._ticket = (self._ticket + 1) % _TICKETS
+        query = arguments == ("?",)
+        values = () if query else tuple(map(_value, arguments))
+        asked = Command(name, values, QUERY if query else 0, self._ticket)
+        self._commands.clear()
+        self._transport.write(encode_command(asked))
+        answer = self._await(
+            name,
+            lambda c: c.name == name and c.ticket == asked.ticket and not c.flags & UPDATE,
+            patience or self._wanted.patience,
+        )
+        text = " ".join(
+            value if isinstance(value, str) else f"{value:.9g}"
+            for value in answer.values
+            if not isinstance(value, bytes)
+        )
+        if query and answer.flags & QUERY and not answer.values:
+            raise self._unanswered(name, answer.name.encode())  # our own words come back
+        if answer.flags & ERROR:
+            raise RefusedError(
+                f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose what it has"
+            )
+        return Answer(encode_command(asked), text)
+
+    def _await(self, what: str, wanted: Callable[[Command], bool], patience: float) -> Command:
+        deadline = self._monotonic() + patience
+        while True:
+            data = self._read_answer(self._said, partial(self._unanswered, what))
+            self._said = (self._said + data)[-64:]
+            self._early += self._receive(data)
+            commands, self._commands = self._commands, []
+            for command in commands:
+                if wanted(command):
+                    return command
+            if self._monotonic() > deadline:
+                understood = self._decoder.statistics.packets > 0
+                raise self._unanswered(what, b"" if understood else self._said)
+
+    def _receive(self, data: bytes) -> list[Data]:
+        """Return the samples in ``data``; commands are kept apart."""
+        return self._sorted(self._decoder.feed(data))
+
+    def _sorted(self, messages: Sequence[Message]) -> list[Data]:
+        found = []
+        for message in messages:
+            if isinstance(message, Command):
+                self._commands.append(message)
+            elif isinstance(message, Data):
+                found.append(message)
+        return found
+
+    def _decode(self, data: bytes) -> Samples:
+        early, self._early = self._early, []
+        return self._joined([*early, *self._receive(data)])
+
+    def _ahead(self) -> float:
+        """A packet counts when the next one has begun, of which samples have come, too."""
+        waiting = self._decoder.statistics.bytes_pending - HEADER.size - DATA_BODY.size
+        return max(waiting, 0) / self._sample_bytes
+
+    def _rest(self) -> Samples:
+        return self._joined(self._sorted(self._decoder.settle()))
+
+    def _joined(self, measured: Sequence[Data]) -> Samples:
+        parts = [self._samples(message) for message in measured]
+        self._commands.clear()  # updates nobody asked for
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _samples(self, message: Data) -> Samples:
+        self._signals = tuple(number for number, _, _ in message.format.signals)
+        if missing := set(self._selection) - set(self._signals):
+            self._decoder.reset()  # what waits is no better
+            raise DeviceError(
+                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
+                f"sends {self._signals!r}; choose signals that it has"
+            )
+        self._sample_bytes = message.format.dtype.itemsize
+        samples = self._convert(message.records)
+        samples["time"] = message.times_ns
+        return samples
+
+
+def _value(argument: str | float) -> Value:
+    return argument if isinstance(argument, str | int) else float(argument)

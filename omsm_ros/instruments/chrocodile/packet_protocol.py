@@ -1,0 +1,378 @@
+"""The packet protocol of Precitec CHRocodile 2 (TCP port 7891), little-endian throughout.
+
+Every packet begins with a magic number and its length. Commands, their answers and updates
+carry arguments; a data format says what the samples of the data packets with the same counter
+hold. Distances and encoders are those of the dollar protocol, by the same signal numbers.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.errors import ConfigurationError, ProtocolError
+from omsm_ros.instruments.chrocodile.telegram import FLOAT, S16, S32, U16, U32, Records
+from omsm_ros.units import NANOSECONDS_PER_S
+
+MAGIC = 0xAA55AA55
+MAX_PACKET_BYTES = 4096
+COMMAND, DATA_FORMAT, DATA = 0x00444D43, 0x00544644, 0x00544144
+# Flags of a command.
+QUERY, UPDATE, WARNING, ERROR = 0x0001, 0x2000, 0x4000, 0x8000
+INT, REAL, STRING, CHAR, BLOB = range(5)
+# The last update after connecting.
+CONFIGURED = "CONF"
+# No probe measures slower or faster; another rate is a damaged packet.
+LEAST_RATE_HZ, GREATEST_RATE_HZ = 1e-3, 1e8
+# Of a triggered sample: its time after the packet's [s / 2^32].
+TIME_OFFSET = 91
+
+FORMATS = {U16: "<u2", S16: "<i2", U32: "<u4", S32: "<i4", FLOAT: "<f4"}
+
+HEADER = struct.Struct("<Ii8xI")  # magic, length, type
+_COMMAND = struct.Struct("<IIIHHHH")  # id, destination, source, flags, -, ticket, arguments
+_FORMAT = struct.Struct("<Iifi")  # stream, counter, rate [Hz], signals
+_SIGNAL = struct.Struct("<BBHHH")  # type, -, channels, first channel, signal
+DATA_BODY = struct.Struct("<IiQi")  # stream, counter, time [s / 2^32], samples
+MAGIC_BYTES = struct.pack("<I", MAGIC)
+NUMBER = struct.Struct("<I")
+FIXED_POINT = 2**32
+KINDS = (COMMAND, DATA_FORMAT, DATA)
+
+Value: TypeAlias = int | float | str | bytes
+
+
+def name_code(name: str) -> int:
+    """Return a command's number: its letters, low byte first; ConfigurationError if none."""
+    if not (name.isascii() and name.isupper() and 3 <= len(name) <= 4):
+        raise ConfigurationError(f"command {name!r}, expected three or four capitals")
+    return int.from_bytes(name.encode(), "little")
+
+
+class Command(NamedTuple):
+    """A command, its answer, or an update.  ticket: of the command that is answered."""
+
+    name: str
+    values: tuple[Value, ...] = ()
+    flags: int = 0
+    ticket: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class DataFormat:
+    """What samples hold.  rate: [Hz];  signals: number, type and channels of each, in order."""
+
+    counter: int
+    rate: float
+    signals: tuple[tuple[int, int, int], ...]
+    stream: int = 0
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """One sample: a field a signal, named by its number, of its first channel."""
+        sizes = [channels * np.dtype(FORMATS[kind]).itemsize for _, kind, channels in self.signals]
+        offsets = np.cumsum([0, *sizes]).tolist()
+        return np.dtype(
+            {
+                "names": [str(number) for number, _, _ in self.signals],
+                "formats": [FORMATS[kind] for _, kind, _ in self.signals],
+                "offsets": offsets[:-1],
+                "itemsize": offsets[-1],
+            }
+        )
+
+
+class Data(NamedTuple):
+    """Samples (n,) of one format, and the device's time of each [ns]."""
+
+    format: DataFormat
+    records: Records
+    times_ns: NDArray[np.int64]
+
+
+Message: TypeAlias = Command | DataFormat | Data
+
+
+# Encoding.
+
+
+def _packet(kind: int, body: bytes) -> bytes:
+    return HEADER.pack(MAGIC, HEADER.size + len(body), kind) + body
+
+
+def _argument(value: Value) -> bytes:
+    if isinstance(value, int):
+        return struct.pack("<Ii", INT, value)
+    if isinstance(value, float):
+        return struct.pack("<If", REAL, value)
+    kind, raw = (STRING, value.encode()) if isinstance(value, str) else (BLOB, value)
+    return struct.pack("<II", kind, len(raw)) + raw + bytes(-len(raw) % 4)
+
+
+def encode_command(command: Command) -> bytes:
+    """Wire bytes of a command, an answer or an update."""
+    arguments = b"".join(map(_argument, command.values))
+    head = _COMMAND.pack(
+        name_code(command.name), 0, 0, command.flags, 0, command.ticket, len(command.values)
+    )
+    return _packet(COMMAND, head + arguments)
+
+
+def encode_format(form: DataFormat) -> bytes:
+    """Wire bytes of a data format."""
+    signals = b"".join(_SIGNAL.pack(kind, 0, n, 0, number) for number, kind, n in form.signals)
+    head = _FORMAT.pack(form.stream, form.counter, form.rate, len(form.signals))
+    return _packet(DATA_FORMAT, head + signals)
+
+
+def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
+    """Wire bytes of a data packet; ConfigurationError if the samples do not fit into one.
+
+    time_ns: of the first sample
+    """
+    most = (MAX_PACKET_BYTES - HEADER.size - DATA_BODY.size) // form.dtype.itemsize
+    if len(records) > most:
+        raise ConfigurationError(f"{len(records)} samples do not fit a packet of {most}")
+    fixed = time_ns * FIXED_POINT // NANOSECONDS_PER_S
+    head = DATA_BODY.pack(form.stream, form.counter, fixed % 2**64, len(records))
+    return _packet(DATA, head + records.tobytes())
+
+
+# Decoding.
+
+
+def decode_command(body: bytes) -> Command:
+    """Return the command in a packet's body; ProtocolError or struct.error if it is none."""
+    code, _, _, flags, _, ticket, count = _COMMAND.unpack_from(body)
+    name = code.to_bytes(4, "little").rstrip(b"\0").decode("latin-1")
+    values: list[Value] = []
+    place = _COMMAND.size
+    for _ in range(count):
+        (kind,) = NUMBER.unpack_from(body, place)
+        value, size = _decode_argument(kind, body, place + NUMBER.size)
+        values.append(value)
+        place += NUMBER.size + size
+    return Command(name, tuple(values), flags, ticket)
+
+
+def _decode_argument(kind: int, body: bytes, place: int) -> tuple[Value, int]:
+    """Return the value and size [bytes] of the argument at ``place``."""
+    if kind in (INT, REAL):
+        (number,) = struct.unpack_from("<i" if kind == INT else "<f", body, place)
+        return number, 4
+    if kind == CHAR:
+        return body[place : place + 1].decode("latin-1"), 4
+    if kind not in (STRING, BLOB):
+        raise ProtocolError(f"argument of type {kind!r}")
+    (length,) = NUMBER.unpack_from(body, place)
+    raw = body[place + 4 : place + 4 + length]
+    if len(raw) < length:
+        raise ProtocolError(f"argument of {length!r} bytes reaches beyond its packet")
+    return (
+        raw.rstrip(b"\0").decode("latin-1") if kind == STRING else raw
+    ), 4 + length + -length % 4
+
+
+def decode_format(body: bytes) -> DataFormat:
+    """Return the data format in a packet's body; ProtocolError or struct.error if none."""
+    stream, counter, rate, count = _FORMAT.unpack_from(body)
+    rows = [_SIGNAL.unpack_from(body, _FORMAT.size + i * _SIGNAL.size) for i in range(count)]
+    signals = tuple((number, kind, channels) for kind, _, channels, _, number in rows)
+    numbers = [number for number, _, _ in signals]
+    known = all(kind in FORMATS and channels > 0 for _, kind, channels in signals)
+    offset = next((kind for number, kind, _ in signals if number == TIME_OFFSET), S32)
+    sound = known and offset == S32 and LEAST_RATE_HZ <= rate <= GREATEST_RATE_HZ
+    if not signals or not sound or len(set(numbers)) < count:
+        raise ProtocolError(f"data format of {rate!r} Hz with signals {signals!r}")
+    return DataFormat(counter, rate, signals, stream)
+
+
+# Packets of a CHRocodile 2, in any portions → commands, data formats and samples.
+
+
+@dataclass(frozen=True, slots=True)
+class PacketStatistics:
+    """What became of every byte: ``received = in packets + discarded + pending``.
+
+    packets: understood;  malformed: whose inside made no sense
+    unformatted: samples without the format that says what they hold
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    packets: int
+    malformed: int
+    unformatted: int
+
+
+class PacketDecoder:
+    """Bytes in any portions → messages; nothing raises, memory is one packet and a portion.
+
+    Messages are a function of the bytes alone, however they were cut. So samples wait until
+    the next packet has begun, or for :meth:`settle`; commands and formats do not.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._formats: dict[int, DataFormat] = {}
+        self._received = self._understood = self._packets = 0
+        self._malformed = self._unformatted = 0
+
+    def reset(self) -> None:
+        """Forget an unfinished packet and all formats, as after connecting anew."""
+        self._buffer = b""
+        self._formats.clear()
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Return messages completed by ``data``; neighbouring samples of one format in one."""
+        self._received += len(data)
+        self._buffer += data
+        found: list[Message] = []
+        waiting: list[tuple[bytes, int, int]] = []
+        start = 0
+        while (place := self._buffer.find(MAGIC_BYTES, start)) >= 0:
+            length = self._length(place)
+            if length is None:
+                start = place
+                break
+            start = place + (self._open(place, length, found, waiting) if length else 1)
+        else:
+            start = max(start, len(self._buffer) - len(MAGIC_BYTES) + 1)
+        self._flush(found, waiting)
+        self._buffer = self._buffer[start:]
+        return found
+
+    def settle(self) -> list[Message]:
+        """Return the packet that waited for what follows it, now that nothing does."""
+        size = len(self._buffer)
+        if not (self._buffer.startswith(MAGIC_BYTES) and self._length(0, last=True) == size):
+            return []
+        found: list[Message] = []
+        waiting: list[tuple[bytes, int, int]] = []
+        self._buffer = self._buffer[self._open(0, size, found, waiting) :]
+        self._flush(found, waiting)
+        return found
+
+    @property
+    def statistics(self) -> PacketStatistics:
+        """Return what became of every byte."""
+        return PacketStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - self._understood - len(self._buffer),
+            bytes_pending=len(self._buffer),
+            packets=self._packets,
+            malformed=self._malformed,
+            unformatted=self._unformatted,
+        )
+
+    def _length(self, place: int, *, last: bool = False) -> int | None:
+        """Return the length of the packet at ``place``; 0 = it is none; None = wait for more.
+
+        last: nothing follows it
+        """
+        if place + HEADER.size > len(self._buffer):
+            return None
+        length: int
+        _, length, kind = HEADER.unpack_from(self._buffer, place)
+        if not _is_head(length, kind) or self._cut_off(place, place + length, kind):
+            return 0
+        end = place + length
+        if end > len(self._buffer):
+            return None
+        after = self._buffer[end : end + len(MAGIC_BYTES)]
+        if kind != DATA or after == MAGIC_BYTES or (last and not after):
+            return length
+        # Samples have no check of their own; what follows shows whether they are too many or few.
+        return None if MAGIC_BYTES.startswith(after) else 0
+
+    def _cut_off(self, place: int, end: int, kind: int) -> bool:
+        """Return whether the next packet begins inside the one up to ``end``: its end is missing.
+
+        What cannot be told from the bytes before ``end`` is not: bytes that are not here yet
+        must not change the answer. Only samples wait for what follows them; in the end of the
+        others the magic alone counts.
+        """
+        inside = self._buffer.find(MAGIC_BYTES, place + len(MAGIC_BYTES), end)
+        while 0 <= inside <= len(self._buffer) - HEADER.size and inside <= end - HEADER.size:
+            _, size, other = HEADER.unpack_from(self._buffer, inside)
+            if _is_head(size, other):
+                return True
+            inside = self._buffer.find(MAGIC_BYTES, inside + 1, end)
+        return kind != DATA and inside > end - HEADER.size
+
+    def _open(
+        self, place: int, length: int, found: list[Message], waiting: list[tuple[bytes, int, int]]
+    ) -> int:
+        """Understand the packet at ``place``; how many bytes to go on."""
+        body = self._buffer[place + HEADER.size : place + length]
+        (kind,) = NUMBER.unpack_from(self._buffer, place + HEADER.size - 4)
+        try:
+            self._understand(kind, body, found, waiting)
+        except (ProtocolError, struct.error):
+            self._malformed += 1
+            return 1
+        self._packets += 1
+        self._understood += length
+        return length
+
+    def _understand(
+        self, kind: int, body: bytes, found: list[Message], waiting: list[tuple[bytes, int, int]]
+    ) -> None:
+        if kind == DATA:
+            self._data(body, found, waiting)
+            return
+        self._flush(found, waiting)
+        if kind == COMMAND:
+            found.append(decode_command(body))
+        else:
+            form = decode_format(body)
+            self._formats[form.stream] = form
+            found.append(form)
+
+    def _data(
+        self, body: bytes, found: list[Message], waiting: list[tuple[bytes, int, int]]
+    ) -> None:
+        stream, counter, fixed, count = DATA_BODY.unpack_from(body)
+        form = self._formats.get(stream)
+        if count < 0:
+            raise ProtocolError(f"data packet of {count!r} samples")
+        if form is None or form.counter != counter:
+            self._unformatted += count
+            return
+        payload = body[DATA_BODY.size :]
+        if not 0 <= len(payload) - count * form.dtype.itemsize < 4:  # padded, at most
+            raise ProtocolError(f"{count!r} samples in {len(payload)} bytes")
+        if waiting and waiting[0][2] != stream:
+            self._flush(found, waiting)
+        time_ns = fixed * NANOSECONDS_PER_S // FIXED_POINT
+        waiting.append((payload[: count * form.dtype.itemsize], time_ns, stream))
+
+    def _flush(self, found: list[Message], waiting: list[tuple[bytes, int, int]]) -> None:
+        """Join the samples that wait into one message."""
+        if not waiting:
+            return
+        form = self._formats[waiting[0][2]]
+        size = form.dtype.itemsize
+        records = np.frombuffer(b"".join(payload for payload, _, _ in waiting), form.dtype)
+        counts = np.array([len(payload) // size for payload, _, _ in waiting])
+        starts = np.repeat([time_ns for _, time_ns, _ in waiting], counts).astype(np.int64)
+        within = np.arange(len(records)) - np.repeat(np.cumsum(counts) - counts, counts)
+        waiting.clear()
+        found.append(Data(form, records, starts + _after(form, records, within)))
+
+
+def _is_head(length: int, kind: int) -> bool:
+    return kind in KINDS and HEADER.size < length <= MAX_PACKET_BYTES
+
+
+def _after(form: DataFormat, records: Records, within: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the time after the packet's [ns] of the ``within``-th sample of a packet."""
+    if str(TIME_OFFSET) in (records.dtype.names or ()):
+        fraction = records[str(TIME_OFFSET)].astype(np.float64) / FIXED_POINT
+        return np.rint(fraction * NANOSECONDS_PER_S).astype(np.int64)
+    return np.rint(within / form.rate * NANOSECONDS_PER_S).astype(np.int64)

@@ -1,0 +1,285 @@
+"""Which sample is it? Wrapping device counters → one trigger counter that never wraps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import IntArray
+from omsm_ros.units import NANOSECOND_S
+
+SAMPLE = np.dtype(
+    [
+        ("counter", "<i8"),  # as the device sends it, wraps
+        ("time", "<i8"),  # of the device [ns], does not wrap; 0 where it has none
+        ("distance", "<f8"),  # [m], NaN where there is none
+        ("intensity", "<f4"),  # 0-1, NaN where the device tells none
+        ("status", "u1"),  # Status
+        ("counts", "<i8", (5,)),  # encoders X, Y, Z, B, C
+    ]
+)
+Samples: TypeAlias = NDArray[np.void]
+"""Structured array of shape (n,), dtype ``SAMPLE``: what every device's driver makes first."""
+
+# A gap and the time that passed may differ by this much, since arrivals are not even [s].
+_SLACK_S = 0.5
+# Copies of samples that were sent before are recognised this far back.
+_REMEMBERED = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Samples (n,) with consecutive trigger counts from ``first_sample``.
+
+    restarted: the device started anew just before
+    """
+
+    samples: Samples
+    first_sample: int
+    restarted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Counting:
+    """How a device counts.
+
+    modulus: its counter starts again at zero there
+    timed: its samples carry its own time
+    checked: a checksum guards the counter; without, a counter that leaps and comes back with
+    the next sample is a spoilt telegram
+    period: of a device that runs freely [s]: its counter goes on in a silence, as far as time
+    does; 0 = triggered, its counter waits for the next trigger
+    """
+
+    modulus: int
+    timed: bool = True
+    checked: bool = True
+    period: float = 0.0
+
+
+class SequenceTracker:
+    """Samples in the order of arrival → runs, with everything that is missing or too much counted.
+
+    The same sample again is a duplicate. A counter or a time that falls back is a restarted
+    device, and its own number counts from there; so is, after a silence, a counter at zero.
+    Anything else that is not the next number is a gap.
+    """
+
+    def __init__(self, counting: Counting) -> None:
+        self.duplicates = self.lost = self.gaps = self.restarts = self.spoilt = 0
+        self._counting = counting
+        self._raw = self._time = self._counter = 0
+        self._begun = self._anew = False
+        self._held = np.empty(0, SAMPLE)
+        self._recent = np.zeros(_REMEMBERED, SAMPLE)
+        self._recent["counter"] = -1
+
+    @property
+    def held(self) -> int:
+        """Samples that wait for their successor to show whether they are spoilt."""
+        return len(self._held)
+
+    def begin_anew(self) -> None:
+        """Count from the device's next number, for it is known to have been restarted."""
+        self._anew = self._begun
+
+    def split(
+        self, samples: Samples, elapsed: float = 0.0, *, broken: bool = False
+    ) -> Iterator[Run]:
+        """Yield the runs of ``samples`` (n,), in order.
+
+        elapsed: how long nothing had come before [s];  broken: that was a silence, or the line
+        was down
+        """
+        samples, self._held = np.concatenate([self._held, samples]), np.empty(0, SAMPLE)
+        pause = _Break(elapsed, broken)
+        while len(samples):
+            count = 0 if broken or self._anew else self._in_order(samples)
+            if count:
+                yield self._accept(samples[:count], self._counter + 1, False)
+            elif self._waits(samples):
+                self._held = samples.copy()
+                return
+            else:
+                yield from self._one(samples, pause)
+                pause, broken, count = _Break(), False, 1
+            samples = samples[count:]
+
+    def settle(self) -> Iterator[Run]:
+        """Yield the sample held back, when nothing came after it."""
+        held, self._held = self._held, np.empty(0, SAMPLE)
+        if len(held):
+            yield from self._one(held, _Break())
+
+    def _in_order(self, samples: Samples) -> int:
+        """Return how many samples at the beginning just go on."""
+        if not self._begun:
+            return 0
+        steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
+        good = steps == 1
+        if self._counting.timed:
+            good &= np.diff(samples["time"], prepend=self._time) >= 0
+        return len(good) if good.all() else int(np.argmin(good))
+
+    def _accept(self, samples: Samples, first: int, restarted: bool) -> Run:
+        self._begun, self._anew = True, False
+        self._raw, self._time = int(samples["counter"][-1]), int(samples["time"][-1])
+        self._counter = first + len(samples) - 1
+        self._recent[samples["counter"] % _REMEMBERED] = samples
+        return Run(samples, first, restarted)
+
+    def _waits(self, samples: Samples) -> bool:
+        """Return whether the only sample left leaps, so that the next one has to decide."""
+        return len(samples) == 1 and self._leaps(samples[0])
+
+    def _leaps(self, sample: np.void) -> bool:
+        if self._counting.checked or not self._begun or self._anew:
+            return False
+        return self._step(int(sample["counter"])) > 1 and not self._sent_before(sample)
+
+    def _spoilt(self, samples: Samples) -> bool:
+        """Return whether the counter leaps at the first sample and is back at the next."""
+        if len(samples) < 2 or not self._leaps(samples[0]):
+            return False
+        here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
+        return after < here
+
+    def _step(self, raw: int) -> int:
+        return (raw - self._raw) % self._counting.modulus
+
+    def _one(self, samples: Samples, pause: _Break) -> Iterator[Run]:
+        """Yield what becomes of the first of ``samples``, which does not just go on."""
+        sample, alone = samples[0], samples[:1]
+        raw = int(sample["counter"])
+        if not self._begun:
+            yield self._accept(alone, raw, False)
+            return
+        step, advance = self._step(raw), int(sample["time"]) - self._time
+        in_order = step == 1 and advance >= 0
+        if self._spoilt(samples):
+            self.spoilt += 1
+        elif not (in_order or self._anew) and self._sent_before(sample):
+            self.duplicates += 1
+        elif self._anew or self._fallen(raw, step, advance, pause):
+            self.restarts += 1
+            yield self._accept(alone, raw, True)
+        elif step == 0:
+            self.duplicates += 1
+        else:
+            step += self._turns(step, pause) * self._counting.modulus
+            self.lost += step - 1
+            self.gaps += step > 1
+            yield self._accept(alone, self._counter + step, False)
+
+    def _sent_before(self, sample: np.void) -> bool:
+        remembered = self._recent[int(sample["counter"]) % _REMEMBERED]
+        return bool(remembered.tobytes() == sample.tobytes())
+
+    def _fallen(self, raw: int, step: int, advance: int, pause: _Break) -> bool:
+        if step == 1:
+            return advance < 0
+        if pause.broken and raw == 0:
+            return True
+        if step == 0 or advance < 0:
+            return advance != 0
+        period = self._counting.period
+        if not period:
+            return step >= self._counting.modulus // 2
+        if self._counting.timed:
+            return step * period > advance * NANOSECOND_S + 2 * period
+        if not pause.broken:
+            return (step - 1) * period > pause.elapsed + _SLACK_S
+        whole = step + self._turns(step, pause) * self._counting.modulus
+        return abs(pause.elapsed - whole * period) > _SLACK_S
+
+    def _turns(self, step: int, pause: _Break) -> int:
+        """Return the whole turns of the counter that a silence hid."""
+        if not self._counting.period:
+            return 0
+        hidden = pause.elapsed / self._counting.period - step
+        return max(0, round(hidden / self._counting.modulus))
+
+
+@dataclass(frozen=True, slots=True)
+class _Break:
+    """What lay before a sample."""
+
+    elapsed: float = 0.0
+    broken: bool = False
+
+
+# Whole turns of encoders that wrap, also past telegrams that noise on the wire has garbled.
+
+# Of a turn: no axis changes its step by more from one sample to the next.
+_LITTLE = 1 / 64
+# Steps in a row that differ by little: this is where the axis is, wherever it was before. Of
+# garbled counts so many do so by chance once in 10⁹.
+_ALIKE = 6
+
+_Steps = TypeVar("_Steps", IntArray, int)
+
+
+class Turns:
+    """Continues the counts of an encoder that starts again at zero after ``wrap``; 0 = never.
+
+    The axis moves less than half a turn between two samples, so a step is the shorter way round.
+    Two steps to a garbled count and back may add up to a whole turn. So the count before a jump is
+    kept: what comes back to it, or goes on elsewhere, has the turns that bring it next to it.
+    """
+
+    def __init__(self, wrap: int) -> None:
+        self._wrap = wrap
+        self._last = self._step = 0
+        self._seen = 0  # samples since the first, or since one whose first steps differed
+        self._kept: int | None = None  # the count before a jump
+        self._since = self._alike = 0
+
+    def continued(self, counts: IntArray) -> IntArray:
+        """Return the counts (n,) with their whole turns; the first of all are within one."""
+        if not self._wrap:
+            return counts
+        if self._seen > _ALIKE and self._kept is None:
+            steps = self._shorter(np.diff(counts, prepend=self._last))
+            before = np.concatenate([[self._step], steps[:-1]])
+            if np.all(np.abs(steps - before) <= _LITTLE * self._wrap):
+                turned: IntArray = self._last + np.cumsum(steps)
+                if len(turned):
+                    self._last, self._step = int(turned[-1]), int(steps[-1])
+                return turned
+        return np.array([self._next(int(count)) for count in counts], dtype=np.int64)
+
+    def _next(self, count: int) -> int:
+        step = self._shorter(count - self._last)
+        value = self._last + step
+        differs = abs(step - self._step) > _LITTLE * self._wrap
+        if self._kept is not None:
+            value, step = self._after_a_jump(value, step, differs)
+        elif self._seen <= _ALIKE:
+            if self._seen == 0 or (self._seen > 1 and differs):  # the one before was garbled
+                value, step, self._seen = count, 0, 0
+            self._seen += 1
+        elif differs:
+            self._kept, self._since, self._alike = self._last, 0, 0
+        self._last, self._step = value, step
+        return value
+
+    def _after_a_jump(self, value: int, step: int, differs: bool) -> tuple[int, int]:
+        assert self._kept is not None
+        self._since += 1
+        self._alike = 0 if differs else self._alike + 1
+        off = self._shorter(value - self._kept)
+        if abs(off) <= _LITTLE * self._wrap:
+            value, step, self._kept = self._kept + off, 0, None
+        elif self._alike >= _ALIKE:
+            if self._alike < self._since - 1:  # else it went there at once: a gap
+                value = self._kept + off
+            self._kept = None
+        return value, step
+
+    def _shorter(self, steps: _Steps) -> _Steps:
+        half = self._wrap // 2
+        return (steps + half) % self._wrap - half

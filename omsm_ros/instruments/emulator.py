@@ -1,0 +1,417 @@
+"""What every emulated instrument has in common: a clock, a line, and faults on command.
+
+A model fills in how it answers and how it packs samples. The instrument measures whether
+anybody listens or not: what is not sent is lost, its counter goes on.
+
+Not imitated: latency of the link, baud rate and UART overrun, jitter of the trigger.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray, Status
+from omsm_ros.errors import DeviceError
+from omsm_ros.twin.cell import Recording
+from omsm_ros.units import NANOSECONDS_PER_S, PPM
+
+# What an emulated device measures: the twin's recordings, or samples that hold their number.
+
+AXES = ("x", "y", "z", "b", "c")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Consecutive samples, arrays of shape (n,).
+
+    distance: [m], NaN where there is none;  intensity: 0-1;  status: Status
+    axes: x, y, z [m], b, c [rad] by name
+    """
+
+    distance: FloatArray
+    intensity: NDArray[np.float32]
+    status: NDArray[np.uint8]
+    axes: dict[str, FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+
+class Source(Protocol):
+    """What there is to measure, sample by sample of a trigger."""
+
+    length: float
+    period: float
+
+    def take(self, first: int, count: int) -> Measured:
+        """Return samples ``first`` to ``first + count``; those beyond the length are left out."""
+
+
+class RecordingSource:
+    """A motion of the twin, once."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.length = len(recording.axes)
+        self.period = recording.axes.sample_period
+
+    def take(self, first: int, count: int) -> Measured:
+        part = slice(first, first + count)
+        axes, distance = self._recording.axes, self._recording.distance
+        size = len(axes.z[part])
+        reported = len(distance.intensity) > 0
+        return Measured(
+            distance.distance[part],
+            distance.intensity[part] if reported else np.full(size, 0.5, np.float32),
+            distance.status[part] if len(distance.status) else np.zeros(size, np.uint8),
+            {name: getattr(axes, name)[part] for name in AXES},
+        )
+
+
+class NumberedSource:
+    """Without end; sample k stands at x = k nm, so every sample shows which one it is.
+
+    The other channels follow from k too: see ``NumberedSource.take``.
+    """
+
+    def __init__(self, period: float = 1e-3) -> None:
+        self.length = math.inf
+        self.period = period
+
+    def take(self, first: int, count: int) -> Measured:
+        """Return distance (10 + k mod 80) µm, y -k nm, z k mod 1000 µm, b k µrad, c k mrad."""
+        k = np.arange(first, first + count, dtype=np.float64)
+        return Measured(
+            (10 + k % 80) * 1e-6,
+            np.full(count, 0.5, np.float32),
+            np.full(count, Status.OK, np.uint8),
+            {"x": k * 1e-9, "y": -k * 1e-9, "z": k % 1000 * 1e-6, "b": k * 1e-6, "c": k * 1e-3},
+        )
+
+
+# Samples are written this often; shorter costs processor time, longer bunches arrivals.
+WRITE_INTERVAL_S = 0.005
+# Bounds memory and the response to a stop, however fast the time lapse.
+_MAX_SAMPLES = 2000
+
+
+class Line(Protocol):
+    """What carries the bytes: a ``Pty`` or a ``TcpServer``."""
+
+    @property
+    def has_reader(self) -> bool:
+        """Return whether anybody listens."""
+
+    @property
+    def sessions(self) -> int:
+        """Return how many clients have come so far."""
+        ...
+
+    def read(self) -> bytes:
+        """Return what the driver sent; b"" if nothing."""
+
+    def write(self, data: bytes, stop: threading.Event | None = None) -> int:
+        """Send, and return how many bytes of ``data`` were taken."""
+
+    def plug(self) -> None:
+        """Offer the line."""
+
+    def unplug(self) -> None: ...
+
+
+@dataclass(slots=True)
+class Faults:
+    """Faults that are still to come: counts are used up, the others last until set back.
+
+    lose, duplicate: samples not sent, sent twice
+    saturate, drop_out: samples the probe calls saturated, or sees no target in
+    noise: random bytes on the line before the next samples
+    cut: bytes missing in the middle of what is sent next
+    garbage_answers: commands answered with rubbish
+    slow_answers: how late commands are answered [s]
+    ignore_commands: commands not answered at all
+    merge: samples are kept and sent together this long after [s]
+    rate: how much faster than set it measures, without saying so [1]
+    drift: of its clock [ppm]
+    """
+
+    lose: int = 0
+    duplicate: int = 0
+    saturate: int = 0
+    drop_out: int = 0
+    noise: int = 0
+    cut: int = 0
+    garbage_answers: int = 0
+    slow_answers: float = 0.0
+    ignore_commands: int = 0
+    merge: float = 0.0
+    rate: float = 1.0
+    drift: float = 0.0
+
+
+class Instrument:
+    """A device that is switched on when made; ``step`` lets it do what is due.
+
+    truth: numbers of the samples sent, in order, as ``(true number, device counter)``; the
+    true number counts triggers since the source began, and never falls back
+    """
+
+    counter_range = 2**16
+
+    def __init__(
+        self,
+        line: Line,
+        source: Source | None = None,
+        *,
+        triggered: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        seed: int = 1,
+    ) -> None:
+        """triggered: samples only while a motion plays, with the motion's own trigger."""
+        self.faults = Faults()
+        self.truth: list[tuple[int, int]] = []
+        self.keep_truth = False
+        self._line = line
+        self._source: Source | None = source if source or triggered else NumberedSource()
+        self._triggered = triggered
+        self._clock = clock
+        self._random = np.random.default_rng(seed)
+        self._lapse = 1.0
+        self._taken = 0  # samples of the source
+        self._counter = 0
+        self._origin = self._started = clock()
+        self._due = 0.0  # samples measured since ``_origin``
+        self._clock_offset = 0
+        self._quiet_until = self._off_until = 0.0
+        self._unplugged = False
+        self._kept, self._kept_since = b"", 0.0
+        self._later: list[tuple[float, bytes]] = []
+        self._session = 0
+        self.reset()
+
+    # What a model fills in.
+
+    def reset(self) -> None:
+        """Set everything as after switching on."""
+
+    def rate(self) -> float:
+        """Return the samples per second as set."""
+        return 1 / self._source.period if self._source is not None else 1.0
+
+    def streaming(self) -> bool:
+        """Return whether samples are to be sent."""
+        return True
+
+    def work(self) -> None:
+        """Do what else there is to do."""
+
+    def greet(self) -> None:
+        """Do what is done for a new client."""
+
+    def receive(self, data: bytes) -> None:
+        """Take commands, in any portions."""
+
+    def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+        """Wire bytes of each sample, or of several in their first one's place."""
+        raise NotImplementedError
+
+    # Time.
+
+    def step(self, stop: threading.Event | None = None) -> None:
+        """Do what is due now: come back, answer, measure, send."""
+        now = self._clock()
+        if now < self._off_until:
+            self._measure(now)
+            return
+        if self._unplugged:
+            self._line.plug()
+            self._unplugged = False
+        if now < self._quiet_until:
+            self._measure(now)
+            return
+        try:
+            self._exchange(now, stop)
+        except (DeviceError, OSError):
+            # The cable may be pulled, by another thread, while something is on its way.
+            if self._clock() >= self._off_until:
+                raise
+
+    def _exchange(self, now: float, stop: threading.Event | None) -> None:
+        self.work()
+        data = self._line.read()
+        if self._line.sessions != self._session:
+            self._session = self._line.sessions
+            self._later.clear()
+            self.greet()
+        if data:
+            self.receive(data)
+        self._send_answers(now, stop)
+        self._send(self._measure(now), now, stop)
+
+    def serve(self, stop: threading.Event) -> None:
+        """Work until ``stop``."""
+        while not stop.wait(WRITE_INTERVAL_S):
+            self.step(stop)
+
+    def play(self, source: Source, time_lapse: float = 1.0) -> None:
+        """Begin a motion: its own trigger, the counter from zero."""
+        self._source, self._lapse = source, time_lapse
+        self._taken = self._counter = 0
+        self._origin, self._due = self._clock(), 0.0
+
+    @property
+    def played(self) -> int:
+        """Samples of the motion measured so far."""
+        return self._taken
+
+    @property
+    def playing(self) -> bool:
+        """Whether a motion has samples left."""
+        return self._source is not None and self._taken < self._source.length
+
+    def halt(self) -> None:
+        """End the motion."""
+        self._source = None
+
+    # Faults on command.
+
+    def unplug(self, seconds: float) -> None:
+        """Take the cable out for a while; the device measures on."""
+        self._off_until = self._clock() + seconds
+        self._line.unplug()
+        self._unplugged = True
+
+    def power_cycle(self, seconds: float) -> None:
+        """Switch off for a while, then on as from the factory, counting from zero."""
+        self.unplug(seconds)
+        self.restart()
+        self._started = self._off_until
+
+    def restart(self) -> None:
+        """Set settings and counter as after switching on; the line stays up."""
+        self._counter = 0
+        self._kept = b""
+        self._later.clear()
+        self._started = self._clock()
+        self.reset()
+
+    def stall(self, seconds: float) -> None:
+        """Stop sending and answering for a while; what was measured meanwhile is lost."""
+        self._quiet_until = self._clock() + seconds
+
+    def reset_counter(self) -> None:
+        """Count from zero again, as upon a trigger command."""
+        self._counter = 0
+
+    def step_clock(self, nanoseconds: int) -> None:
+        """Let the device's clock leap."""
+        self._clock_offset += nanoseconds
+
+    # Measuring and sending.
+
+    def _measure(self, now: float) -> list[bytes]:
+        """Return the samples that have become due, packed; empty while none are to be sent."""
+        elapsed = (now - self._origin) * self._lapse
+        self._origin = now
+        if self._source is None or now < self._started:
+            return []
+        self._due += elapsed * self.rate() * self.faults.rate
+        most = _MAX_SAMPLES if self._sending() else self._due
+        count = int(min(self._due, most, self._source.length - self._taken))
+        self._due -= count
+        if count <= 0:
+            return []
+        counters = (self._counter + np.arange(count)) % self.counter_range
+        measured = self._disturb(self._source.take(self._taken, count))
+        packed = self.pack(measured, counters, self._times(count, now)) if self._sending() else []
+        pieces = self._spoil(packed, self._taken, counters)
+        self._taken += count
+        self._counter = (self._counter + count) % self.counter_range
+        return pieces
+
+    def _sending(self) -> bool:
+        return self.streaming() and self._clock() >= max(self._quiet_until, self._off_until)
+
+    def _times(self, count: int, now: float) -> np.ndarray:
+        """Return the device time of the last ``count`` samples [ns]."""
+        true_period = 1 / (self.rate() * self.faults.rate)
+        if self._lapse == 1.0:
+            last = now - self._started - self._due * true_period
+        else:
+            last = (self._taken + count) * true_period
+        seconds = last - np.arange(count)[::-1] * true_period
+        device = seconds * (1 + self.faults.drift * PPM) * NANOSECONDS_PER_S
+        return np.rint(device).astype(np.int64) + self._clock_offset
+
+    def _disturb(self, measured: Measured) -> Measured:
+        """Return the saturation and dropouts, at the beginning of the portion."""
+        status, distance = measured.status.copy(), measured.distance.copy()
+        intensity = measured.intensity.copy()
+        saturated = _use(self.faults, "saturate", len(measured))
+        status[:saturated] = Status.SATURATED
+        lost = slice(
+            saturated, saturated + _use(self.faults, "drop_out", len(measured) - saturated)
+        )
+        status[lost], distance[lost], intensity[lost] = Status.NO_TARGET, np.nan, 0.0
+        return replace(measured, status=status, distance=distance, intensity=intensity)
+
+    def _spoil(self, packed: list[bytes], first: int, counters: np.ndarray) -> list[bytes]:
+        """Lose, double and damage what was packed."""
+        pieces: list[bytes] = []
+        for i, piece in enumerate(packed):
+            if piece and _use(self.faults, "lose", 1):
+                continue
+            if self.keep_truth:
+                self.truth.append((first + i, int(counters[i])))
+            pieces += [piece] * (1 + _use(self.faults, "duplicate", 1))
+        return pieces
+
+    def _send(self, pieces: Iterable[bytes], now: float, stop: threading.Event | None) -> None:
+        wire = b"".join(pieces)
+        if self.faults.noise and wire:
+            wire = self._random.bytes(_use(self.faults, "noise", 1 << 20)) + wire
+        if self.faults.cut and len(wire) > self.faults.cut:
+            place = len(wire) // 2
+            wire = wire[:place] + wire[place + _use(self.faults, "cut", len(wire)) :]
+        if self.faults.merge:
+            self._kept_since = self._kept_since if self._kept else now
+            self._kept += wire
+            if now - self._kept_since < self.faults.merge:
+                return
+            wire = b""
+        wire, self._kept = self._kept + wire, b""
+        if wire:
+            self._line.write(wire, stop)
+
+    # Answers.
+
+    def say(self, wire: bytes) -> None:
+        """Queue an answer, as late and as wrong as the faults have it."""
+        if _use(self.faults, "ignore_commands", 1):
+            return
+        if _use(self.faults, "garbage_answers", 1):
+            wire = self._random.bytes(len(wire))
+        self._later.append((self._clock() + self.faults.slow_answers, wire))
+
+    def _send_answers(self, now: float, stop: threading.Event | None) -> None:
+        while self._later and self._later[0][0] <= now:
+            # What was measured before the answer goes first: a telegram is never cut in two.
+            if self._kept:
+                self._line.write(self._kept, stop)
+                self._kept = b""
+            self._line.write(self._later.pop(0)[1], stop)
+
+
+def _use(faults: Faults, name: str, most: int) -> int:
+    """Use up to ``most`` of a counted fault."""
+    used = min(getattr(faults, name), most)
+    setattr(faults, name, getattr(faults, name) - used)
+    return used

@@ -1,0 +1,1 @@
+"""Micro-Epsilon confocalDT and capaNCDT."""

@@ -1,0 +1,387 @@
+"""Micro-Epsilon confocalDT controllers, over RS-422 or Ethernet.
+
+Untried on hardware. Over RS-422 the driver only listens: which values a frame holds is a
+setting. Over Ethernet the blocks say what they hold, and the rate is set and read back where
+a command port is given.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import IntArray, Status
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
+from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels, wrapping
+from omsm_ros.instruments.chrocodile.telegram import ProbeReading
+from omsm_ros.instruments.command_port import CommandPort
+from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
+from omsm_ros.instruments.micro_epsilon.protocol import (
+    FIRST_ERROR,
+    INTENSITY_FULL,
+    INTENSITY_MASK,
+    VALUE_BITS,
+    Believed,
+    SerialDecoder,
+    channel_dtype,
+    confocal_dtype,
+    distance_of,
+    intensity_leads,
+)
+from omsm_ros.instruments.six_channel.protocol import AXES, AxisScaling
+from omsm_ros.instruments.stream import COUNTER_RANGE, BlockStreamDevice, StreamDevice
+from omsm_ros.instruments.transport import Transport
+from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
+
+SERIAL_VALUES = ("distance", "intensity", "counter")
+# A value of the frame that is passed over.
+PASSED_OVER = "-"
+# Of every answer to GETINFO; a controller that does not know it says so.
+_INFORMATION = rb"Serial|E\d\d"
+_KILOHERTZ = 1000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfocalDtSettings(BlockSettings):
+    """How the controller is read.
+
+    probe: ``full_scale`` is the measuring range, of which RS-422 values are parts
+    values: what a frame holds over RS-422, in order, of SERIAL_VALUES; "-" is passed over
+    axes: scaling of X, Y, Z, B, C, or None;  wired: axes on encoders 1, 2, 3 (0 = X … 4 = C);
+    an axis without an encoder stands at its offset
+    trigger: "free_run", or anything else for a trigger from outside
+    patience: for an answer, and for samples of a controller that runs freely [s]
+    """
+
+    probe: ProbeReading = field(default_factory=ProbeReading)
+    values: tuple[str, ...] = ("distance",)
+    axes: tuple[AxisScaling, ...] | None = None
+    wired: tuple[int, ...] = ()
+    trigger: str = "free_run"
+    patience: float = 2.0
+
+    def __post_init__(self) -> None:
+        BlockSettings.__post_init__(self)
+        named = [value for value in self.values if value != PASSED_OVER]
+        unknown, doubled = set(named) - set(SERIAL_VALUES), len(set(named)) < len(named)
+        if "distance" not in named or unknown or doubled:
+            raise ConfigurationError(
+                f"values {self.values!r}, expected 'distance' and more of {SERIAL_VALUES!r}, each "
+                f"once, in the order of the frame; {PASSED_OVER!r} for another value"
+            )
+        if len(set(self.wired)) < len(self.wired) or set(self.wired) - set(range(len(AXES))):
+            raise ConfigurationError(f"wired {self.wired!r}, expected axes 0 to 4, each once")
+
+    @property
+    def period(self) -> float:
+        """Of a controller that runs freely [s]; 0 = triggered."""
+        return self.sample_period if self.trigger == "free_run" else 0.0
+
+
+class ConfocalDtDevice(StreamDevice):
+    """Listens to three bytes a value.
+
+    Where no counter is selected, frames are counted: a place where bytes were missing counts
+    as one lost sample, a silence as a restart.
+    """
+
+    described_by = "`signals` (what a frame holds)"
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ConfocalDtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        settings = settings or ConfocalDtSettings()
+        counted = "counter" in settings.values
+        modulus = 2**VALUE_BITS if counted else 2**62
+        counting = Counting(modulus, timed=False, checked=not counted, period=settings.period)
+        base = replace(settings, free_running=settings.period > 0)
+        super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
+        self._wanted = settings
+        self._decoder = SerialDecoder(len(settings.values))
+        self._believed = Believed(len(settings.values))
+        self._counted = self._unread = 0
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        waited = {"unconfirmed": self._believed.unconfirmed}
+        return super().counts() | asdict(self._decoder.statistics) | waited
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        self._believed.reset()
+        self._unread = 0
+        if "counter" not in self._wanted.values:
+            self._tracker.begin_anew()
+
+    def _decode(self, data: bytes) -> Samples:
+        values, spoilt = self._believed.feed(*self._decoder.feed(data))
+        self._unread = 0 if len(values) else self._unread + len(data)
+        columns = dict(zip(self._wanted.values, values.T, strict=True))  # "-": the last of them
+        samples = np.zeros(len(values), SAMPLE)
+        raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
+        samples["distance"] = self._wanted.probe.distance(raw)
+        samples["intensity"] = np.nan
+        if "intensity" in columns:
+            light = (columns["intensity"] & INTENSITY_MASK) / INTENSITY_FULL
+            samples["intensity"] = np.minimum(light, 1.0)
+        if "counter" in columns:
+            samples["counter"] = columns["counter"]
+        elif len(samples):
+            samples["counter"] = self._counted + np.cumsum(1 + spoilt) - 1
+            self._counted = int(samples["counter"][-1]) + 1
+        return samples
+
+    def _listen_in(self, silent: float) -> None:
+        if "counter" not in self._wanted.values:
+            self._tracker.begin_anew()
+        self._check_understood(silent, self._unread)
+        _must_talk(self._transport.name, self._wanted, silent)
+
+
+class ConfocalDtEthernetDevice(BlockStreamDevice):
+    """Reads blocks, and sets the measuring rate where there is a command port."""
+
+    prompt = b"->"
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ConfocalDtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+        commands: Transport | None = None,
+    ) -> None:
+        """commands: the controller's port 23; None = leave it as it is set."""
+        settings = settings or ConfocalDtSettings()
+        super().__init__(
+            transport,
+            replace(settings, free_running=settings.period > 0),
+            Channels(axes=wrapping(settings.axes, COUNTER_RANGE), timed=False),
+            kind="confocal",
+            period=settings.period,
+            patience=settings.patience,
+            commands=commands,
+            now_ns=now_ns,
+            monotonic=monotonic,
+        )
+        self._wanted = settings
+        self._intensity_leads = False  # as the manual draws it, until the words tell
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """Return which controller it is, and its rate, where there is a command port."""
+        reported = self._identity
+        return {
+            name: reported[name]
+            for name in ("name", "article", "serial", "rate")
+            if name in reported
+        }
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        return confocal_dtype(kind)
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        identity = _info(port.ask("GETINFO", "\n", _INFORMATION))
+        self._set_rate(port)
+        return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
+
+    def _set_rate(self, port: CommandPort) -> None:
+        wanted = 1 / (self._wanted.sample_period * _KILOHERTZ)
+        said = port.ask(f"MEASRATE {wanted:.4g}", "\n")
+        if error := re.search(r"E\d\d[^\r\n]*", said):
+            raise DeviceError(
+                f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
+            )
+        said = port.ask("MEASRATE", "\n")
+        told = [float(number) for number in re.findall(r"\d+(?:\.\d*)?", said) if float(number) > 0]
+        if not told:
+            raise DeviceError(
+                f"{self._transport.name} did not tell its measuring rate ({said[-64:]!r}); check "
+                "that command_port is this controller's, or set it to 0"
+            )
+        if abs(told[-1] / wanted - 1) > RATE_TOLERANCE:
+            raise DeviceError(
+                f"{self._transport.name}: {wanted:.4g} kHz was asked for, the controller measures "
+                f"at {told[-1]:g} kHz; set sample_period to {1e-3 / told[-1]:.9g} s"
+            )
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        names = frames.dtype.names or ()
+        samples = np.zeros(len(frames), SAMPLE)
+        samples["counter"] = frames["counter"] if "counter" in names else counter
+        raw, light = self._peak(frames)
+        nothing = raw >= FIRST_ERROR
+        metres = np.where(nothing, np.nan, raw * NANOMETRE_M)
+        samples["distance"] = self._wanted.probe.distance(metres)
+        beyond = np.abs(metres) > self._wanted.probe.full_scale
+        samples["status"] = np.select(
+            [nothing, beyond], [Status.NO_TARGET, Status.OUT_OF_RANGE], Status.OK
+        )
+        samples["intensity"] = np.nan
+        if light is not None:
+            samples["intensity"] = np.minimum((light & INTENSITY_MASK) / INTENSITY_FULL, 1.0)
+        for number, axis in enumerate(self._wanted.wired, start=1):
+            samples["counts"][:, axis] = self._encoder(frames, number)
+        return samples
+
+    def _peak(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]]
+    ) -> tuple[IntArray, IntArray | None]:
+        """Distance and intensity of the first peak, in whichever order this controller sends."""
+        distance: IntArray = frames["distance 1"].astype(np.int64)
+        if "intensity 1" not in (frames.dtype.names or ()):
+            return distance, None
+        words = np.stack([distance, frames["intensity 1"].astype(np.int32)], axis=1)
+        told = intensity_leads(words, self._wanted.probe.full_scale / NANOMETRE_M)
+        if told is not None:
+            self._intensity_leads = told
+        first, second = words.T
+        return (second, first) if self._intensity_leads else (first, second)
+
+    def _encoder(self, frames: np.ndarray[tuple[int], np.dtype[np.void]], number: int) -> IntArray:
+        if f"encoder {number}" not in (frames.dtype.names or ()):
+            raise DeviceError(
+                f"{self._transport.name} sends no encoder {number}; select it "
+                "(OUTADD_ETH … ENC1 ENC2 ENC3) or take the axis from `encoders`"
+            )
+        counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
+        return counts
+
+    def _listen_in(self, silent: float) -> None:
+        super()._listen_in(silent)
+        _must_talk(self._transport.name, self._wanted, silent)
+
+
+def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
+    if settings.period and silent > settings.patience:
+        raise NoSamplesError(
+            f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "
+            "interface and (RS-422) baud rate"
+        )
+
+
+def _info(said: str) -> dict[str, str]:
+    """Return the ``Name: value`` lines of an answer."""
+    pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", said)
+    return {key.strip().lower(): value.strip() for key, value in pairs}
+
+
+# A Micro-Epsilon capaNCDT 62xx, a digital capacitive reference: data over TCP, commands beside.
+#
+# Untried on hardware. A controller that is switched off and on leaves its old connection open
+# and silent, so silence alone makes the driver connect anew.
+
+PROMPT = rb"OK *[\r\n]|\$WRONG|\$UNKNOWN"
+# A channel's 24 bits are its measuring range.
+FULL_SCALE = 0xFFFFFF
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CapaNcdtSettings(BlockSettings):
+    """How the controller is read.
+
+    probe: ``full_scale`` is the channel's measuring range [m]
+    channel: of the controller, from 1
+    triggered: samples come with a trigger from outside, not continuously
+    patience: for an answer, and for samples of a controller that runs freely [s]
+    """
+
+    probe: ProbeReading = field(default_factory=lambda: ProbeReading(full_scale=250 * MICROMETRE_M))
+    channel: int = 1
+    triggered: bool = False
+    patience: float = 2.0
+
+    def __post_init__(self) -> None:
+        BlockSettings.__post_init__(self)
+        if not 1 <= self.channel <= 8:
+            raise ConfigurationError(f"channel {self.channel!r}, expected 1 to 8")
+
+
+class CapaNcdtDevice(BlockStreamDevice):
+    """Reads one channel, and sets the sample time where there is a command port."""
+
+    prompt = PROMPT
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: CapaNcdtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+        commands: Transport | None = None,
+    ) -> None:
+        """commands: the controller's port 23; None = leave it as it is set."""
+        settings = settings or CapaNcdtSettings()
+        free = not settings.triggered
+        super().__init__(
+            transport,
+            replace(settings, free_running=free),
+            Channels(timed=False),
+            kind="capacitive",
+            period=settings.sample_period if free else 0.0,
+            patience=settings.patience,
+            commands=commands,
+            now_ns=now_ns,
+            monotonic=monotonic,
+        )
+        self._wanted = settings
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
+        self._set_sample_time(port)
+        return identity
+
+    def _set_sample_time(self, port: CommandPort) -> None:
+        """Set the next sample time that the controller has, which it reports."""
+        wanted = self._wanted.sample_period / MICROSECOND_S
+        said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
+        found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
+        if found is None:
+            raise DeviceError(
+                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}; "
+                "choose another sample_period"
+            )
+        if abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
+            raise DeviceError(
+                f"{self._transport.name}: {wanted:.0f} µs were asked for, the controller samples "
+                f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
+            )
+        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        return channel_dtype(kind[0])
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        name = f"channel {self._wanted.channel}"
+        if name not in (frames.dtype.names or ()):
+            raise DeviceError(
+                f"{self._transport.name} has no {name}, only {frames.dtype.names!r}; set channel"
+            )
+        value = frames[name].astype(np.float64)
+        samples = np.zeros(len(frames), SAMPLE)
+        samples["counter"] = counter
+        raw = value * (self._wanted.probe.full_scale / FULL_SCALE)
+        samples["distance"] = self._wanted.probe.distance(raw)
+        samples["intensity"] = np.nan
+        outside = (value <= 0) | (value >= FULL_SCALE)  # at its stops, it tells no distance
+        samples["status"] = np.where(outside, Status.OUT_OF_RANGE, Status.OK)
+        return samples
+
+    def _listen_in(self, silent: float) -> None:
+        super()._listen_in(silent)
+        if not self._wanted.triggered and silent > self._wanted.patience:
+            raise NoSamplesError(
+                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
+            )

@@ -1,0 +1,427 @@
+"""Blocks of measured values that Micro-Epsilon controllers send over TCP, little-endian.
+
+A header with a preamble, the controller's numbers, what the frames hold, how many there are
+and how long, and the counter of the first; then the frames. ``HEADERS`` has the two forms:
+confocalDT 24xx says by flags what a frame holds, capaNCDT 62xx by a field of channels.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
+from omsm_ros.errors import ProtocolError
+
+# "MEAS" as text, and as a 32-bit number sent low byte first: manuals give both readings.
+PREAMBLES = (b"MEAS", b"SAEM")
+# A TCP packet holds a block; a longer one is a misread header.
+MAX_BLOCK_BYTES = 1 << 20
+
+HEADERS = {
+    # preamble, order, serial, flags 1, flags 2, frames, bytes a frame (or the other way round:
+    # manuals and open clients differ), counter
+    "confocal": struct.Struct("<4sIIIIHHI"),
+    # preamble, order, serial, channels, status, frames, bytes a frame, counter
+    "capacitive": struct.Struct("<4sIIQIHHI"),
+}
+
+# What a frame holds.
+
+_VIDEO_BYTES = 1024
+# Bit of flags 1 → name and size [bytes] of what it adds to a frame, in the order of the frame.
+FLAGS_1: tuple[tuple[int, str, int], ...] = (
+    *((bit, f"video {bit}", _VIDEO_BYTES) for bit in (0, 2, 3, 4, 5, 6)),
+    (7, "exposure", 4),
+    (8, "encoder 1", 4),
+    (9, "encoder 2", 4),
+    (10, "encoder 3", 4),
+    (11, "counter", 4),
+    (12, "time", 4),
+)
+INTENSITY_BIT, VALUE_BIT, PEAK_BITS = 15, 18, range(19, 25)
+AFTER_PEAKS: tuple[tuple[int, str, int], ...] = ((26, "error", 4), (27, "trigger difference", 4))
+FLAGS_2: tuple[tuple[int, str, int], ...] = (
+    (0, "thickness", 4),
+    (15, "minimum", 4),
+    (16, "maximum", 4),
+    (17, "peak to peak", 4),
+)
+# Intensity 100 % is 1024, in the lowest eleven bits; above them is the height of the peak.
+INTENSITY_MASK, INTENSITY_FULL = 0x7FF, 1024
+_NO_INTENSITY = 0xC000F800
+# Distances from here on are error codes, not nanometres.
+FIRST_ERROR = 0x7FFFFF00
+_SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
+
+
+class Block(NamedTuple):
+    """One block.  kind: what its frames hold, in the header's own coding;  frames: (n, bytes)."""
+
+    order: int
+    serial: int
+    kind: tuple[int, int]
+    counter: int
+    frames: NDArray[np.uint8]
+
+
+def confocal_dtype(flags: tuple[int, int]) -> np.dtype[np.void]:
+    """Return what the flags of a confocalDT say a frame holds; ProtocolError without a distance.
+
+    Of a peak with intensity, the two words may stand in either order: see ``intensity_leads``.
+    """
+    fields = [(name, size) for bit, name, size in FLAGS_1 if flags[0] >> bit & 1]
+    peaks = sum(flags[0] >> bit & 1 for bit in PEAK_BITS)
+    if not peaks and flags[0] >> VALUE_BIT & 1:
+        peaks = 1
+    if not peaks:
+        raise ProtocolError(f"flags {flags[0]:#x} {flags[1]:#x} hold no distance")
+    for peak in range(1, peaks + 1):
+        fields.append((f"distance {peak}", 4))
+        if flags[0] >> INTENSITY_BIT & 1:
+            fields.append((f"intensity {peak}", 4))
+    for word, table in ((flags[0], AFTER_PEAKS), (flags[1], FLAGS_2)):
+        fields += [(name, size) for bit, name, size in table if word >> bit & 1]
+    return np.dtype([(name, _format(name, size)) for name, size in fields])
+
+
+def _format(name: str, size: int) -> str:
+    if size == _VIDEO_BYTES:
+        return f"V{size}"
+    return "<i4" if name.startswith(_SIGNED) else "<u4"
+
+
+def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
+    """Return whether the first of a peak's ``words`` (n, 2) is the intensity; None if unknown.
+
+    One manual draws the distance first, others name the intensity first. The words tell: in an
+    intensity bits 11 to 15, 30 and 31 are zero; a distance is at most ``furthest`` [nm], or an
+    error code.
+    """
+    distance = (np.abs(words) <= furthest) | (words >= FIRST_ERROR)
+    light = (words & _NO_INTENSITY == 0) & (words & INTENSITY_MASK <= INTENSITY_FULL)
+    leads, follows = light[:, 0] & distance[:, 1], distance[:, 0] & light[:, 1]
+    votes = int(np.sum(leads & ~follows)) - int(np.sum(follows & ~leads))
+    return votes > 0 if votes else None
+
+
+def channel_dtype(field: int) -> np.dtype[np.void]:
+    """Return what the channel field of a capaNCDT says a frame holds: 24-bit values by channel."""
+    present = [f"channel {i + 1}" for i in range(32) if field >> 2 * i & 0b11]
+    if not present:
+        raise ProtocolError(f"channel field {field:#x} names no channel")
+    return np.dtype([(name, "<i4") for name in present])
+
+
+def encode_block(form: str, block: Block, preamble: bytes = PREAMBLES[0]) -> bytes:
+    """Wire bytes of a block; form: of HEADERS."""
+    head = HEADERS[form].pack(
+        preamble, block.order, block.serial, *block.kind, *block.frames.shape, block.counter
+    )
+    return head + block.frames.tobytes()
+
+
+# Decoding.
+
+
+@dataclass(frozen=True, slots=True)
+class BlockStatistics:
+    """What became of every byte: ``received = in blocks + discarded + pending``.
+
+    packets: understood;  malformed: headers that make no sense
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    packets: int
+    malformed: int
+
+
+class BlockDecoder:
+    """Bytes in any portions → blocks; nothing raises, memory is one block and a portion.
+
+    Blocks are a function of the bytes alone, however they were cut. So a block waits until the
+    next one has begun, or for :meth:`settle`: bytes lost or added inside it show there.
+    """
+
+    def __init__(self, form: str, dtype_of: Callable[[tuple[int, int]], np.dtype[np.void]]) -> None:
+        """form: of HEADERS;  dtype_of: what frames hold, or ProtocolError."""
+        self._header = HEADERS[form]
+        self._dtype_of = dtype_of
+        self._buffer = b""
+        self._received = self._understood = self._packets = self._malformed = 0
+
+    def reset(self) -> None:
+        """Forget an unfinished block, as after connecting anew."""
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> list[Block]:
+        """Return the blocks completed by ``data``, in order."""
+        self._received += len(data)
+        self._buffer += data
+        found: list[Block] = []
+        start = 0
+        while (place := self._find(start)) >= 0:
+            size = self._size(place)
+            if size is None:
+                start = place
+                break
+            if size == 0:
+                self._malformed += 1
+                start = place + 1
+                continue
+            found.append(self._block(place, size))
+            start = place + size
+        else:
+            start = max(start, len(self._buffer) - len(PREAMBLES[0]) + 1)
+        self._buffer = self._buffer[start:]
+        return found
+
+    def settle(self) -> list[Block]:
+        """Return the block that waited for what follows it, now that nothing does."""
+        size = len(self._buffer)
+        if self._find(0) != 0 or self._size(0, last=True) != size:
+            return []
+        found = self._block(0, size)
+        self._buffer = b""
+        return [found]
+
+    @property
+    def statistics(self) -> BlockStatistics:
+        """Return what became of every byte."""
+        return BlockStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - self._understood - len(self._buffer),
+            bytes_pending=len(self._buffer),
+            packets=self._packets,
+            malformed=self._malformed,
+        )
+
+    def _find(self, start: int) -> int:
+        places = [self._buffer.find(preamble, start) for preamble in PREAMBLES]
+        return min((place for place in places if place >= 0), default=-1)
+
+    def _size(self, place: int, *, last: bool = False) -> int | None:
+        """Return the bytes of the block at ``place``; 0 = it is none; None = wait for more.
+
+        last: nothing follows it
+        """
+        if place + self._header.size > len(self._buffer):
+            return None
+        shape = self._shape(self._header.unpack_from(self._buffer, place))
+        if shape is None:
+            return 0
+        size = self._header.size + shape[0] * shape[1]
+        end = place + size
+        if size > MAX_BLOCK_BYTES or self._cut_off(place, end):
+            return 0
+        if end > len(self._buffer):
+            return None
+        after = self._buffer[end : end + len(PREAMBLES[0])]
+        if after in PREAMBLES or (last and not after):
+            return size
+        return None if any(preamble.startswith(after) for preamble in PREAMBLES) else 0
+
+    def _shape(self, fields: tuple[int, ...]) -> tuple[int, int] | None:
+        """Frames, and bytes of each, whichever of the two stands first; None if neither fits."""
+        try:
+            width = self._dtype_of((fields[3], fields[4])).itemsize
+        except ProtocolError:
+            return None
+        first, second = fields[-3], fields[-2]
+        count = first if second == width else second if first == width else 0
+        return (count, width) if count else None
+
+    def _cut_off(self, place: int, end: int) -> bool:
+        """Return whether another block's head stands inside the one up to ``end``."""
+        inside = self._find(place + 1)
+        while 0 <= inside <= min(end, len(self._buffer)) - self._header.size:
+            if self._shape(self._header.unpack_from(self._buffer, inside)) is not None:
+                return True
+            inside = self._find(inside + 1)
+        return False
+
+    def _block(self, place: int, size: int) -> Block:
+        fields = self._header.unpack_from(self._buffer, place)
+        shape = self._shape(fields)
+        assert shape is not None  # it was asked before
+        count, width = shape
+        raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
+        self._packets += 1
+        self._understood += size
+        return Block(fields[1], fields[2], (fields[3], fields[4]), fields[-1], raw.reshape(shape))
+
+
+# Measured values of a Micro-Epsilon confocalDT over RS-422: three bytes a value.
+#
+# Six data bits each, low part first. The two bits above mark them: 00 low, 01 middle, 10 high
+# in the first value of a frame, 11 high in the others. So a byte that is missing always shows.
+
+LOW, MIDDLE, HIGH_FIRST, HIGH_OTHER = 0b00, 0b01, 0b10, 0b11
+# distance = (value - ZERO) · range / SPAN
+ZERO, SPAN = 98_232, 65_536
+# Above it: error values.
+LAST_VALUE = 262_072
+NO_PEAK, BEFORE_RANGE, BEHIND_RANGE, NO_VALUE = 262_076, 262_077, 262_078, 262_079
+VALUE_BITS = 18
+_VALUE_BYTES = 3
+# So many values in a row have their marks by chance once in 64⁵ places, 10⁹ bytes.
+_VALUES_BELIEVED = 5
+
+
+def encode_frames(values: IntArray) -> bytes:
+    """Wire bytes of frames (n, m) of 18-bit values."""
+    parts = np.zeros((*values.shape, _VALUE_BYTES), np.uint8)
+    parts[..., 0] = values & 0x3F
+    parts[..., 1] = values >> 6 & 0x3F | MIDDLE << 6
+    parts[..., 2] = values >> 12 & 0x3F | HIGH_OTHER << 6
+    parts[:, 0, 2] ^= (HIGH_OTHER ^ HIGH_FIRST) << 6
+    return parts.tobytes()
+
+
+def distance_of(values: IntArray, measuring_range: float) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """Return the distance [m], NaN where there is none, and status of 18-bit ``values`` (n,).
+
+    measuring_range: [m]
+    """
+    distance = (values - ZERO) * (measuring_range / SPAN)
+    status = np.full(values.shape, Status.OK, np.uint8)
+    status[values > LAST_VALUE] = Status.NO_TARGET
+    status[(values == BEFORE_RANGE) | (values == BEHIND_RANGE)] = Status.OUT_OF_RANGE
+    return np.where(values > LAST_VALUE, np.nan, distance), status
+
+
+def values_of(distance: FloatArray, measuring_range: float) -> IntArray:
+    """Return 18-bit values of ``distance`` [m] (n,); NaN becomes "no peak"."""
+    scaled = np.rint(np.nan_to_num(distance) * (SPAN / measuring_range)) + ZERO
+    inside = np.clip(scaled, 0, LAST_VALUE).astype(np.int64)
+    return np.where(np.isnan(distance), NO_PEAK, inside)
+
+
+@dataclass(frozen=True, slots=True)
+class SerialStatistics:
+    """What became of every byte: ``received = in frames + discarded + pending``.
+
+    frames: decoded;  malformed: places where something was missing or too much
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    frames: int
+    malformed: int
+
+
+class SerialDecoder:
+    """Bytes in any portions → frames of ``width`` values; nothing raises."""
+
+    def __init__(self, width: int) -> None:
+        """width: values in a frame."""
+        self._width = width
+        self._size = width * _VALUE_BYTES
+        marks = np.tile([LOW, MIDDLE, HIGH_OTHER], width)
+        marks[_VALUE_BYTES - 1] = HIGH_FIRST
+        self._marks = marks.astype(np.uint8)
+        self._buffer = b""
+        self._passed_over = False  # bytes since the last frame that begin none
+        self._received = self._frames = self._malformed = 0
+
+    def reset(self) -> None:
+        """Forget an unfinished frame, as after connecting anew."""
+        self._buffer = b""
+        self._passed_over = False
+
+    def feed(self, data: bytes) -> tuple[IntArray, IntArray]:
+        """Return values (n, width) of the frames completed by ``data``, and how many were spoilt.
+
+        The second, (n,), says for each frame in how many places since the frame before it
+        something was wrong.
+        """
+        self._received += len(data)
+        raw = np.frombuffer(self._buffer + data, np.uint8)
+        starts = self._starts(raw)
+        spoilt = np.zeros(len(starts), np.int64)
+        spoilt[:] = np.diff(starts, prepend=-self._size) != self._size
+        rest = 0
+        if len(starts):
+            spoilt[0] |= self._passed_over
+            rest, self._passed_over = int(starts[-1]) + self._size, False
+        tail = raw[rest:]
+        if len(tail) >= self._size:  # no frame in it: only its end may still become one
+            tail = tail[len(tail) - self._size + 1 :]
+            self._passed_over = True
+        self._buffer = tail.tobytes()
+        self._frames += len(starts)
+        self._malformed += int(spoilt.sum())
+        index = starts[:, np.newaxis] + np.arange(self._size)
+        parts = raw[index].reshape(len(starts), self._width, _VALUE_BYTES).astype(np.int64) & 0x3F
+        return parts[..., 0] | parts[..., 1] << 6 | parts[..., 2] << 12, spoilt
+
+    @property
+    def statistics(self) -> SerialStatistics:
+        """Return what became of every byte."""
+        decoded = self._frames * self._size
+        return SerialStatistics(
+            bytes_received=self._received,
+            bytes_discarded=self._received - decoded - len(self._buffer),
+            bytes_pending=len(self._buffer),
+            frames=self._frames,
+            malformed=self._malformed,
+        )
+
+    def _starts(self, raw: NDArray[np.uint8]) -> NDArray[np.intp]:
+        """Return where whole frames begin; frames never overlap, since their marks do not."""
+        if len(raw) < self._size:
+            return np.empty(0, np.intp)
+        windows = np.lib.stride_tricks.sliding_window_view(raw >> 6, self._size)
+        return np.flatnonzero((windows == self._marks).all(axis=1))
+
+
+class Believed:
+    """Frames that are more than chance: enough of them came one after the other at once.
+
+    Nothing but the marks vouches for a value, and in noise, or at another baud rate, every 64th
+    place has them. So after every place where something was wrong frames wait for the next ones.
+
+    unconfirmed: frames that waited in vain
+    """
+
+    def __init__(self, width: int) -> None:
+        """width: values in a frame."""
+        self._width = width
+        self._needed = -(-_VALUES_BELIEVED // width)
+        self.unconfirmed = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Believe nothing, as after connecting anew."""
+        self._waiting: list[tuple[IntArray, IntArray]] = []
+        self._confirmed = False
+
+    def feed(self, values: IntArray, spoilt: IntArray) -> tuple[IntArray, IntArray]:
+        """Return what to believe of what :meth:`SerialDecoder.feed` returned and of what waited."""
+        found: list[tuple[IntArray, IntArray]] = []
+        breaks = np.flatnonzero(spoilt)
+        edges = np.unique(np.concatenate([[0], breaks, [len(values)]]))
+        for start, end in itertools.pairwise(edges):
+            if spoilt[start]:
+                self.unconfirmed += self._held()
+                self.reset()
+            self._waiting.append((values[start:end], spoilt[start:end]))
+            if self._confirmed or self._held() >= self._needed:
+                self._confirmed = True
+                found += self._waiting
+                self._waiting = []
+        if not found:
+            return np.empty((0, self._width), np.int64), np.empty(0, np.int64)
+        return np.concatenate([f for f, _ in found]), np.concatenate([s for _, s in found])
+
+    def _held(self) -> int:
+        return sum(len(values) for values, _ in self._waiting)

@@ -1,0 +1,171 @@
+"""Keeps a device read, whatever happens on its line."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from enum import Enum
+from typing import Protocol
+
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError, defect
+from omsm_ros.instruments.blocks import BlockPair
+
+_READ_S = 0.05
+# The pause before connecting again doubles from the first to the second [s].
+BACK_OFF_S = (0.25, 5.0)
+
+
+class Readable(Protocol):
+    """What a reader reads."""
+
+    @property
+    def trouble(self) -> str:
+        """Return why its samples cannot be used; empty if they can."""
+
+    def open(self) -> None:
+        """Connect and set up; raises DeviceError."""
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """Return blocks that came within ``timeout`` [s]; raises DeviceError."""
+
+    def close(self) -> list[BlockPair]:
+        """Disconnect and return the partial block."""
+
+
+class State(Enum):
+    """Of a reader."""
+
+    CONNECTING = "connecting"  # or setting the device up
+    READING = "reading"
+    LOST = "lost"  # waits before it connects again
+    ENDED = "ended"
+
+
+class DeviceReader:
+    """Connects, reads, hands blocks over, and connects again after growing pauses.
+
+    trouble: what keeps it from reading, one line; empty while all is well. That a device sends
+    nothing readable stays until samples come: connecting anew does not disprove it.
+    connections: how often the device was connected and set up
+    """
+
+    def __init__(
+        self,
+        device: Readable,
+        deliver: Callable[[Sequence[BlockPair]], None],
+        note: Callable[[str], None] = lambda _: None,
+        complain: Callable[[str], None] = lambda _: None,
+        back_off: tuple[float, float] = BACK_OFF_S,
+        connected: Callable[[], None] = lambda: None,
+    ) -> None:
+        """complain, note: called once for each new trouble, and when it is over
+        connected: called when the device was set up, before its samples are delivered
+        """
+        self.state = State.CONNECTING
+        self.trouble = "not connected yet"
+        self.connections = 0
+        self._device = device
+        self._deliver = deliver
+        self._note, self._complain = note, complain
+        self._back_off = back_off
+        self._when_connected = connected
+        self._unproven = False
+        self._requests: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
+            queue.SimpleQueue()
+        )
+
+    def ask(self, request: Callable[[], None], patience: float) -> None:
+        """Let the reading thread do ``request`` to the device between two reads, and wait for it.
+
+        Raises what ``request`` raises; DeviceError where the device is not being read, or after
+        ``patience`` [s].
+        """
+        if self.state is not State.READING:
+            raise DeviceError(f"the device is not being read now: {self.trouble or 'it ended'}")
+        done: Future[None] = Future()
+        self._requests.put((request, done))
+        try:
+            done.result(patience)
+        except TimeoutError as err:
+            done.cancel()
+            raise DeviceError(f"the device did not do it within {patience:g} s") from err
+
+    def _do_requests(self) -> None:
+        while not self._requests.empty():
+            request, done = self._requests.get()
+            if not done.set_running_or_notify_cancel():
+                continue
+            try:
+                request()
+            except Exception as err:  # told to who asked
+                done.set_exception(err)
+            else:
+                done.set_result(None)
+
+    def run(self, stop: threading.Event) -> None:
+        """Read until ``stop``."""
+        pause = self._back_off[0]
+        while not stop.is_set():
+            if self._read_once(stop):
+                pause = self._back_off[0]
+            if stop.wait(pause):
+                break
+            pause = min(2 * pause, self._back_off[1])
+        self.state = State.ENDED
+
+    def _read_once(self, stop: threading.Event) -> bool:
+        """Read until the device is lost; whether any sample came."""
+        self.state, any_came = State.CONNECTING, False
+        try:
+            self._device.open()
+            self._connected()
+            while not stop.is_set():
+                self._do_requests()
+                blocks = self._device.poll(_READ_S)
+                any_came |= bool(blocks)
+                self._hand_over(blocks)
+        except (DeviceError, ConfigurationError) as err:
+            self._unproven = isinstance(err, NoSamplesError)
+            self.state = State.LOST
+            self._tell(str(err))
+        except Exception as err:  # a defect of ours must not end the reading for good
+            self.state = State.LOST
+            self._tell(defect(err))
+        self._let_go()
+        return any_came
+
+    def _let_go(self) -> None:
+        """Disconnect and hand over the partial block, whatever state the device is in."""
+        try:
+            self._hand_over(self._device.close())
+        except (DeviceError, ConfigurationError) as err:
+            self._tell(str(err))
+        except Exception as err:  # a defect of ours must not end the reading for good
+            self._tell(defect(err))
+
+    def _connected(self) -> None:
+        self.connections += 1
+        self.state = State.READING
+        if not self._unproven:
+            self._tell("")
+        self._when_connected()
+
+    def _hand_over(self, blocks: Sequence[BlockPair]) -> None:
+        if blocks:
+            self._deliver(blocks)
+        if self.state is State.READING:
+            self._unproven &= not blocks
+            if self._device.trouble or not self._unproven:
+                self._tell(self._device.trouble)
+
+    def _tell(self, trouble: str) -> None:
+        if trouble != self.trouble:
+            self.trouble = trouble
+            if not trouble:
+                self._note("connected and set up")
+            elif self.state is State.READING:
+                self._complain(trouble)
+            else:
+                self._complain(f"{trouble}; trying again")

@@ -1,0 +1,1 @@
+"""The generic six-channel stream, binary and text."""

@@ -1,0 +1,365 @@
+"""The generic six-channel stream: one frame a trigger, one probe and five encoders.
+
+Each frame is the little-endian table ``FRAME``, its last four bytes the CRC-32 of all
+before them, encoded by COBS and ended by 00. COBS leaves no 00 inside a frame, so a
+reader that lost its place finds it again at the next 00. Empty frames (00 00) are idle
+line and mean nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from cobs import cobs
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
+from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
+
+AXES = ("x", "y", "z", "b", "c")
+
+FRAME = np.dtype(
+    [
+        ("sequence", "<u4"),  # trigger counter, wraps
+        ("device_time", "<u8"),  # [ns]
+        ("distance", "<i4"),  # [nm]
+        ("status", "u1"),  # core.records.Status
+        ("counts", "<i8", (len(AXES),)),  # encoders in the order of AXES
+        ("crc", "<u4"),  # of all bytes before it
+    ]
+)
+FrameArray: TypeAlias = NDArray[np.void]
+"""Structured array of shape (n,), dtype ``FRAME``."""
+
+BODY_SIZE = FRAME.fields["crc"][1]  # type: ignore[index]
+# COBS adds exactly one byte to, and takes it from, anything shorter than 254.
+SEGMENT_SIZE = FRAME.itemsize + 1
+ENCODED_SIZE = SEGMENT_SIZE + 1
+TERMINATOR = b"\0"
+# CRC-32 over any data followed by its own CRC-32 (little-endian) is this constant.
+CRC_RESIDUE = 0x2144DF1C
+
+
+def encode_frames(frames: FrameArray) -> bytes:
+    """Wire bytes of ``frames`` (n,): n · ENCODED_SIZE; the field ``crc`` is filled in here."""
+    raw = frames.tobytes()
+    parts = []
+    for start in range(0, len(raw), FRAME.itemsize):
+        body = raw[start : start + BODY_SIZE]
+        parts.append(cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")))
+    return b"".join(part + TERMINATOR for part in parts)
+
+
+@dataclass(frozen=True, slots=True)
+class DecoderStatistics:
+    """What became of every byte: ``received = ENCODED_SIZE · frames + discarded + pending``.
+
+    bad_length, bad_cobs, bad_crc: segments between terminators that are no frame
+    """
+
+    bytes_received: int
+    bytes_discarded: int
+    bytes_pending: int
+    frames: int
+    bad_length: int
+    bad_cobs: int
+    bad_crc: int
+
+
+class FrameDecoder:
+    """Bytes in any portions → frames that passed length, COBS and CRC-32.
+
+    Nothing raises, whatever arrives; memory is bounded by one frame and one portion.
+    """
+
+    def __init__(self) -> None:
+        self._tail = b""
+        self._bytes = self._frames = 0
+        self._bad = {"length": 0, "cobs": 0, "crc": 0}
+
+    def feed(self, data: bytes) -> FrameArray:
+        """Return frames completed by ``data``, shape (n,), in the order of arrival; n may be 0."""
+        self._bytes += len(data)
+        *segments, tail = (self._tail + data).split(TERMINATOR)
+        # A byte more than a frame already tells that this segment is none: keep no more of it.
+        self._tail = tail[: SEGMENT_SIZE + 1]
+        bodies = [body for segment in segments if (body := self._open(segment)) is not None]
+        self._frames += len(bodies)
+        return np.frombuffer(b"".join(bodies), FRAME)
+
+    def reset(self) -> None:
+        """Forget a frame that was cut off, as after a lost connection."""
+        self._bad["length"] += bool(self._tail)
+        self._tail = b""
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """Return all counts since the decoder was made."""
+        return DecoderStatistics(
+            bytes_received=self._bytes,
+            bytes_discarded=self._bytes - ENCODED_SIZE * self._frames - len(self._tail),
+            bytes_pending=len(self._tail),
+            frames=self._frames,
+            bad_length=self._bad["length"],
+            bad_cobs=self._bad["cobs"],
+            bad_crc=self._bad["crc"],
+        )
+
+    def _open(self, segment: bytes) -> bytes | None:
+        if len(segment) != SEGMENT_SIZE:
+            self._bad["length"] += bool(segment)
+            return None
+        try:
+            body: bytes = cobs.decode(segment)
+        except cobs.DecodeError:
+            self._bad["cobs"] += 1
+            return None
+        if zlib.crc32(body) != CRC_RESIDUE:
+            self._bad["crc"] += 1
+            return None
+        return body
+
+
+def _check_sign(name: str, sign: int) -> None:
+    if sign not in (1, -1):
+        raise ConfigurationError(f"{name} {sign!r}, expected 1 or -1")
+
+
+def _integers(name: str, values: FloatArray, kind: type[np.signedinteger[Any]]) -> FloatArray:
+    lowest = float(np.iinfo(kind).min)
+    outside = ~((values >= lowest) & (values < -lowest))  # also true for NaN
+    if outside.any():
+        raise DataError(
+            f"{name} of {float(values[outside][0])!r} counts does not fit {kind.__name__}"
+        )
+    return values
+
+
+@dataclass(frozen=True, slots=True)
+class AxisScaling:
+    """``value = offset + sign · counts / counts_per_unit``.
+
+    counts_per_unit: counts per metre or per radian;  sign: +1 or -1
+    offset: position at count zero [m or rad]
+    wrap: counts after which the encoder starts again at zero; 0 = it never does
+    """
+
+    counts_per_unit: float
+    sign: int = 1
+    offset: float = 0.0
+    wrap: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.counts_per_unit < np.inf:
+            raise ConfigurationError(
+                f"counts_per_unit {self.counts_per_unit!r}, expected a positive finite number; "
+                "use sign to turn an axis round"
+            )
+        _check_sign("sign", self.sign)
+        if not np.isfinite(self.offset):
+            raise ConfigurationError(f"offset {self.offset!r}, expected a finite number")
+        if self.wrap < 0:
+            raise ConfigurationError(f"wrap {self.wrap!r} counts, expected 0 (never) or more")
+
+    def values(self, counts: IntArray) -> FloatArray:
+        """Return the positions [m or rad] of unwrapped ``counts`` (n,)."""
+        return self.offset + counts / (self.sign * self.counts_per_unit)
+
+    def counts(self, values: FloatArray) -> IntArray:
+        """Return what the encoder reports at ``values`` [m or rad] (n,), in whole counts."""
+        scaled = np.rint((values - self.offset) * (self.sign * self.counts_per_unit))
+        whole = _integers("axis position", scaled, np.int64).astype(np.int64)
+        return whole % self.wrap if self.wrap else whole
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeScaling:
+    """How the probe's int32 [nm] becomes a distance.
+
+    full_scale: a reading further from zero than this is OUT_OF_RANGE [m]
+    polarity: -1 for a probe whose reading grows towards the target
+    invalid: the reading that means "no target" [nm]
+    """
+
+    full_scale: float = 100 * MICROMETRE_M
+    polarity: int = 1
+    invalid: int = -(2**31)
+
+    def __post_init__(self) -> None:
+        if not self.full_scale > 0:
+            raise ConfigurationError(f"full_scale {self.full_scale!r} m is not positive")
+        _check_sign("polarity", self.polarity)
+        limits = np.iinfo(np.int32)
+        if not limits.min <= self.invalid <= limits.max:
+            raise ConfigurationError(f"invalid {self.invalid!r} nm does not fit an int32")
+
+    def readings(self, frames: FrameArray) -> tuple[FloatArray, NDArray[np.uint8]]:
+        """Return the distance [m], NaN where there is none, and status, each of shape (n,).
+
+        What the device calls bad stays so; a status this package does not know is LOST.
+        """
+        raw = frames["distance"]
+        nothing = raw == self.invalid
+        distance = np.where(nothing, np.nan, self.polarity * NANOMETRE_M * raw.astype(float))
+        status = np.where(known_status(frames), frames["status"], Status.LOST)
+        good = status == Status.OK
+        status = np.where(good & nothing, Status.NO_TARGET, status)
+        beyond = good & (abs(distance) > self.full_scale)
+        return distance, np.where(beyond, Status.OUT_OF_RANGE, status).astype(np.uint8)
+
+    def counts(self, distance: FloatArray) -> NDArray[np.int32]:
+        """Return what the device sends for ``distance`` [m] (n,); NaN is sent as ``invalid``."""
+        scaled = np.rint(distance * (self.polarity / NANOMETRE_M))
+        sent = np.where(np.isnan(distance), self.invalid, scaled)
+        return _integers("probe distance", sent, np.int32).astype(np.int32)
+
+
+def known_status(frames: FrameArray) -> NDArray[np.bool_]:
+    """Return True where the device's verdict is one of ``Status``, shape (n,)."""
+    return np.asarray(frames["status"] <= max(Status))
+
+
+LINEAR = AxisScaling(counts_per_unit=1e10)  # 0.1 nm a count
+ROTARY = AxisScaling(counts_per_unit=1e9)  # 1 nrad a count
+
+
+@dataclass(frozen=True, slots=True)
+class StreamScaling:
+    """Counts ↔ SI for the five axes and the probe."""
+
+    x: AxisScaling = LINEAR
+    y: AxisScaling = LINEAR
+    z: AxisScaling = LINEAR
+    b: AxisScaling = ROTARY
+    c: AxisScaling = ROTARY
+    probe: ProbeScaling = field(default_factory=ProbeScaling)
+
+    @property
+    def axes(self) -> tuple[AxisScaling, ...]:
+        """In the order of AXES."""
+        return tuple(getattr(self, name) for name in AXES)
+
+
+# The six-channel stream as text: one line a sample, columns by name.
+#
+# Separated by commas or blanks, so what LinuxCNC's ``halsampler -t`` pipes out is read too (the
+# sample's number first, then the pins in their order). Axes are counts, with decimals if they
+# have any; distance is in nanometres, time in nanoseconds. Lines end with LF, CR or both. One that
+# holds anything else, or another number of columns, is no sample.
+
+AXIS_COLUMNS = ("x", "y", "z", "b", "c")
+COLUMNS = ("sequence", "device_time", "distance", "status", *AXIS_COLUMNS)
+SKIPPED = "-"
+_WHOLE = ("sequence", "device_time", "status")
+# A longer line is none.
+MAX_LINE_BYTES = 1024
+_INTEGER = re.compile(rb"[-+]?\d{1,19}")
+_NUMBER = re.compile(rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
+_SEPARATOR = re.compile(rb"[,;\s]+")
+
+
+# A line whose numbers cannot be what they are called is none: counts that no counter reaches,
+# times of centuries, positions of hundreds of metres in tenths of a nanometre.
+_RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
+_RANGES |= dict.fromkeys(AXIS_COLUMNS, (-(2**40), 2**40))
+_OTHER_RANGE = (-(2**62), 2**62)
+
+
+def check_columns(columns: Sequence[str]) -> None:
+    """Raise ConfigurationError unless ``columns`` can be read.
+
+    Each is one of COLUMNS, once, or SKIPPED; the sequence must be there, and something measured.
+    """
+    named = [name for name in columns if name != SKIPPED]
+    if set(named) - set(COLUMNS) or len(set(named)) < len(named):
+        raise ConfigurationError(f"columns {columns!r}, expected {COLUMNS!r}, each at most once")
+    if "sequence" not in named or not {"distance", *AXIS_COLUMNS} & set(named):
+        raise ConfigurationError(f"columns {columns!r} need a sequence, and distance or axes")
+
+
+def row_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
+    """Return one line: whole numbers int64, the others float64."""
+    named = [name for name in columns if name != SKIPPED]
+    return np.dtype([(name, "<i8" if name in _WHOLE else "<f8") for name in named])
+
+
+def encode_lines(rows: NDArray[np.void], columns: Sequence[str] = COLUMNS) -> list[bytes]:
+    """Wire bytes of ``rows`` (n,) with a field a column."""
+    lists = [rows[name].tolist() for name in columns]
+    return [(",".join(map(_text, row)) + "\n").encode() for row in zip(*lists, strict=True)]
+
+
+def _text(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.17g}"
+
+
+@dataclass(frozen=True, slots=True)
+class LineStatistics:
+    """What became of every byte and line.  lines: read;  malformed: lines that are no sample."""
+
+    bytes_received: int
+    bytes_pending: int
+    lines: int
+    malformed: int
+
+
+class CsvDecoder:
+    """Bytes in any portions → rows; nothing raises, memory is one line and a portion."""
+
+    def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
+        """Raises ConfigurationError for columns that cannot be read."""
+        check_columns(columns)
+        self._columns = tuple(columns)
+        self._dtype = row_dtype(columns)
+        self._tail = b""
+        self._received = self._lines = self._malformed = 0
+
+    def reset(self) -> None:
+        """Forget a line that was cut off."""
+        self._malformed += bool(self._tail)
+        self._tail = b""
+
+    def feed(self, data: bytes) -> NDArray[np.void]:
+        """Return the rows completed by ``data``, shape (n,)."""
+        self._received += len(data)
+        *lines, tail = (self._tail + data).replace(b"\r", b"\n").split(b"\n")
+        self._tail = tail[: MAX_LINE_BYTES + 1]
+        rows = [row for line in lines if (row := self._row(line)) is not None]
+        self._lines += len(rows)
+        return np.array(rows, self._dtype)
+
+    @property
+    def statistics(self) -> LineStatistics:
+        """Return what became of every byte and line."""
+        return LineStatistics(self._received, len(self._tail), self._lines, self._malformed)
+
+    def _row(self, line: bytes) -> tuple[float, ...] | None:
+        words = [word for word in _SEPARATOR.split(line) if word]
+        if not words:
+            return None
+        row = self._values(words) if len(line) <= MAX_LINE_BYTES else None
+        self._malformed += row is None
+        return row
+
+    def _values(self, words: list[bytes]) -> tuple[float, ...] | None:
+        if len(words) != len(self._columns):
+            return None
+        row: list[float] = []
+        for name, word in zip(self._columns, words, strict=True):
+            if name == SKIPPED:
+                continue
+            whole = name in _WHOLE
+            if not (_INTEGER if whole else _NUMBER).fullmatch(word):
+                return None
+            value = int(word) if whole else float(word)
+            least, most = _RANGES.get(name, _OTHER_RANGE)
+            if not least <= value <= most:
+                return None
+            row.append(value)
+        return tuple(row)

@@ -1,0 +1,367 @@
+"""What every device that sends samples has in common: from bytes to blocks, all accounted for.
+
+``decoded = delivered + pending + held + duplicates + spoilt + withheld``; what never came is
+``lost``, what came broken is counted by the decoder of the protocol.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from omsm_ros.errors import DeviceError, NoSamplesError
+from omsm_ros.instruments.blocks import BlockCutter, BlockPair, BlockSettings, Channels
+from omsm_ros.instruments.command_port import CommandPort
+from omsm_ros.instruments.counting import SAMPLE, Counting, Samples, SequenceTracker
+from omsm_ros.instruments.micro_epsilon.protocol import HEADERS, Block, BlockDecoder
+from omsm_ros.instruments.transport import Transport
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Bytes without a sample for so long are another device's, or come at another baud rate.
+UNREADABLE_S = 2.0
+_ANSWER_S = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamStatistics:
+    """Everything counted since construction, exact between two calls of ``poll``.
+
+    decoded: samples that came whole
+    delivered, pending: in blocks handed over, and waiting for their block to fill
+    held: waiting for their successor;  spoilt: whose counter leapt there and back
+    duplicates: received twice
+    withheld: kept back because the device runs at another rate than it was set to
+    lost, gaps: trigger counts that never arrived, and in how many places
+    restarts: the device's counter or clock fell back
+    period_deviation: of the last full block's device time from nominal, relative
+    period_warnings: full blocks beyond PERIOD_TOLERANCE
+    renewals: connections made anew, because nothing came
+    """
+
+    decoded: int = 0
+    delivered: int = 0
+    pending: int = 0
+    held: int = 0
+    spoilt: int = 0
+    duplicates: int = 0
+    withheld: int = 0
+    lost: int = 0
+    gaps: int = 0
+    restarts: int = 0
+    blocks: int = 0
+    period_deviation: float = 0.0
+    period_warnings: int = 0
+    renewals: int = 0
+
+
+class StreamDevice:
+    """Reads a stream of samples and hands over blocks.
+
+    A model fills in ``_prepare`` (set it up), ``_decode`` and ``_rest`` (bytes → samples) and
+    ``_listen_in`` (is it still there?). The trigger count lives on over ``close`` and
+    ``open``, so what a lost connection cost shows up as a gap.
+
+    described_by: the parameter that tells what the stream holds, where the device cannot
+    """
+
+    described_by = ""
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: BlockSettings,
+        channels: Channels,
+        counting: Counting,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """now_ns: the host clock that stamps refer to [ns];  monotonic: for time-outs [s]."""
+        self.channels = channels
+        self._transport = transport
+        self._settings = settings
+        self._now_ns = now_ns
+        self._monotonic = monotonic
+        self._tracker = SequenceTracker(counting)
+        self._cutter = BlockCutter(settings, channels)
+        self._decoded = 0
+        self._heard = self._opened = monotonic()
+        self._came_ns, self._came_at = 0, self._heard  # when the last bytes did
+        self._down = False
+        self._renewals = 0
+        self._went_on = self._heard  # when a counter last went on
+
+    def open(self) -> None:
+        """Connect, or connect again, and set the device up; raises DeviceError."""
+        self._transport.open()
+        self._down = True
+        self._prepare()
+        self._opened = self._went_on = self._monotonic()
+
+    def poll(self, timeout: float) -> list[BlockPair]:
+        """Return the blocks completed by what arrives within ``timeout`` [s]; may be none.
+
+        Raises DeviceError when the connection or the device is lost; ``close`` then still
+        hands over the partial block.
+        """
+        data = self._transport.read(timeout)
+        arrival_ns, now = self._now_ns(), self._monotonic()
+        if data or not self._came_ns:
+            self._came_ns, self._came_at = arrival_ns, now
+        samples = self._decode(data)
+        silent = now - self._heard
+        if len(samples):
+            self._heard = now
+            blocks = self._add(samples, arrival_ns, silent)
+            self._check_counter(now, int(samples["counter"][-1]))
+            return blocks
+        if silent <= self._settings.pause:
+            return []
+        blocks = self._end(arrival_ns)
+        silent = now - max(self._heard, self._opened)
+        self._listen_in(silent)
+        if 0 < self._settings.renew < silent:
+            # One that still says nothing may be at rest; one that is gone refuses.
+            self.open()
+            self._renewals += 1
+        return blocks
+
+    def close(self) -> list[BlockPair]:
+        """Disconnect and hand over the partial block, if any."""
+        blocks = self._end(self._now_ns())
+        self._transport.close()
+        return blocks
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Make, model, version and settings as the device reported them; empty before it did."""
+        return {}
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """What a calibration belongs to: how the device measures, as far as it reported; JSON."""
+        return {}
+
+    @property
+    def trouble(self) -> str:
+        """Why the samples cannot be used although the device sends them; empty if they can."""
+        if self._cutter.wrong_rate:
+            period = self._settings.sample_period
+            found = 1 / (period * (1 + self._cutter.period_deviation))
+            return (
+                f"{self._transport.name} measures at {found:.6g} Hz, set is {1 / period:.6g} Hz; "
+                "its samples are withheld: set sample_period to what the device does"
+            )
+        return ""
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        """What became of every sample."""
+        tracker, cutter = self._tracker, self._cutter
+        return StreamStatistics(
+            decoded=self._decoded,
+            delivered=cutter.delivered,
+            pending=cutter.pending,
+            held=tracker.held,
+            spoilt=tracker.spoilt,
+            duplicates=tracker.duplicates,
+            withheld=cutter.withheld,
+            lost=tracker.lost,
+            gaps=tracker.gaps,
+            restarts=tracker.restarts,
+            blocks=cutter.blocks,
+            period_deviation=cutter.period_deviation,
+            period_warnings=cutter.period_warnings,
+            renewals=self._renewals,
+        )
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return asdict(self.statistics)
+
+    # What a model fills in.
+
+    def _prepare(self) -> None:
+        """Set the device up; raises DeviceError."""
+
+    def _decode(self, data: bytes) -> Samples:
+        """Return the samples that ``data`` completes, shape (n,); n may be 0."""
+        raise NotImplementedError
+
+    def _rest(self) -> Samples:
+        """Return samples that were complete, but waited for what follows them; shape (n,)."""
+        return np.empty(0, SAMPLE)
+
+    def _ahead(self) -> float:
+        """By how many samples that which has arrived is ahead of what was decoded."""
+        return 0.0
+
+    def _listen_in(self, silent: float) -> None:
+        """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
+
+    # Common.
+
+    def _check_understood(self, silent: float, unread: int) -> None:
+        """Raise NoSamplesError if bytes keep coming, but for ``silent`` [s] no sample in them.
+
+        unread: bytes that came since the last sample, an idle line's left out
+        """
+        if silent > UNREADABLE_S and unread:
+            described = f"{self.described_by}, " if self.described_by else ""
+            raise NoSamplesError(
+                f"{self._transport.name} sends bytes ({unread} in {silent:.1f} s), but no samples "
+                f"of this device; check {described}the baud rate and what is connected"
+            )
+
+    def _read_answer(self, said: bytes, unanswered: Callable[[bytes], DeviceError]) -> bytes:
+        """Return what comes; where another service hangs up, raise what tells what it ``said``."""
+        try:
+            return self._transport.read(_ANSWER_S)
+        except DeviceError as err:
+            if b"HTTP" in said or b"SSH" in said:
+                raise unanswered(said) from err
+            raise
+
+    def _check_counter(self, now: float, counter: int) -> None:
+        """Raise NoSamplesError if samples keep coming, but only such as came before."""
+        if now - self._went_on > UNREADABLE_S:
+            raise NoSamplesError(
+                f"{self._transport.name} repeats its sample counter, {counter!r} last, so every "
+                "sample counts as a duplicate; check that the driver's settings name the counter "
+                "in its place, and that it counts"
+            )
+
+    def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
+        self._decoded += len(samples)
+        after_silence = self._down or silent > self._settings.pause
+        self._down = False
+        runs = list(self._tracker.split(samples, silent, broken=after_silence))
+        if runs:
+            self._went_on = self._monotonic()
+        waited = self._ahead() * self._settings.sample_period
+        came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
+        return list(self._cutter.add(runs, came_ns, after_silence=after_silence))
+
+    def _end(self, arrival_ns: int) -> list[BlockPair]:
+        """Return everything that waited, now that nothing follows."""
+        rest, blocks = self._rest(), []
+        if len(rest):
+            silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
+            blocks = self._add(rest, self._came_ns or arrival_ns, silent)
+        blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)
+        return [*blocks, *self._cutter.flush()]
+
+
+# What Micro-Epsilon's Ethernet controllers have in common: blocks of data, commands beside.
+
+COUNTER_RANGE = 2**32
+# Begins the blocks of controllers whose heads do not say what the frames hold.
+_UNDESCRIBED = b"DATA"
+
+
+class BlockStreamDevice(StreamDevice):
+    """Decodes blocks, and talks to the controller where there is a command port.
+
+    A model fills in ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
+    (commands), and says what ends an answer (a regular expression).
+    """
+
+    prompt: bytes = b""
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: BlockSettings,
+        channels: Channels,
+        *,
+        kind: str,
+        period: float,
+        patience: float,
+        commands: Transport | None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """kind: of :class:`BlockDecoder`;  period: of a controller that runs freely [s], else 0
+        patience: for an answer [s];  commands: the controller's port 23; None = leave it as it is
+        """
+        counting = Counting(COUNTER_RANGE, timed=False, period=period)
+        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        self._decoder = BlockDecoder(kind, self._frame)
+        self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
+        self._unread, self._undescribed = 0, False
+        self._commands, self._answers_within = commands, patience
+        self._identity: dict[str, str] = {}
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Return what the controller reported of itself."""
+        return self._identity
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        self._unread, self._undescribed = 0, False
+        if self._commands is None:
+            return
+        within = self._answers_within
+        with CommandPort(self._commands, self.prompt, within, self._monotonic) as port:
+            self._identity = self._set_up(port)
+
+    def _decode(self, data: bytes) -> Samples:
+        samples = self._converted(self._decoder.feed(data))
+        self._unread = 0 if len(samples) else self._unread + len(data)
+        self._undescribed = not len(samples) and (self._undescribed or _UNDESCRIBED in data)
+        return samples
+
+    def _ahead(self) -> float:
+        """A block counts when the next one has begun, of which frames have come, too."""
+        waiting = self._decoder.statistics.bytes_pending - self._head_bytes
+        return max(waiting, 0) / self._frame_bytes
+
+    def _rest(self) -> Samples:
+        return self._converted(self._decoder.settle())
+
+    def _converted(self, blocks: list[Block]) -> Samples:
+        parts = []
+        for block in blocks:
+            self._identity = {
+                "order": str(block.order), "serial": str(block.serial), **self._identity,
+            }  # fmt: skip
+            self._frame_bytes = block.frames.shape[1]
+            frames = block.frames.reshape(-1).view(self._frame(block.kind))
+            counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
+            try:
+                parts.append(self._samples_of(frames, counter))
+            except DeviceError:
+                self._decoder.reset()  # what waits is no better
+                raise
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _listen_in(self, silent: float) -> None:
+        if silent > UNREADABLE_S and self._undescribed:
+            raise NoSamplesError(
+                f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not say "
+                "what they hold; read this controller over RS-422 (device: confocaldt)"
+            )
+        self._check_understood(silent, self._unread)
+
+    # What a model fills in.
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        """Return the fields of a frame, by the flags in the block's head."""
+        raise NotImplementedError
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        """Return the samples of the frames (n,) of a block, with their ``counter`` (n,)."""
+        raise NotImplementedError
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        """Set what was asked for, and return what the controller reports of itself."""
+        raise NotImplementedError

@@ -1,0 +1,1 @@
+"""Files and messages: bags, tables, maps, results."""

@@ -1,0 +1,330 @@
+"""Is a bag what it claims to be, and can it be read in bounded memory?
+
+A bag comes from anywhere: its index may promise what is not there, its definitions may order the
+fields otherwise than ours, and a few bytes of it may unpack to gigabytes.
+"""
+
+from __future__ import annotations
+
+from binascii import crc32
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from operator import itemgetter
+from os import SEEK_CUR, SEEK_END, fstat
+from pathlib import Path
+from struct import Struct, unpack_from
+from types import SimpleNamespace
+from typing import IO, Any, TypeAlias
+
+from lz4.frame import LZ4FrameDecompressor
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError, storage_mcap, storage_sqlite3
+from rosbags.rosbag2 import reader as bag_folder
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_mcap import McapReader, decompress
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from omsm_ros.errors import BagError
+from omsm_ros.io.files import open_regular, said
+from omsm_ros.quantities import shown
+
+# rosbag2 writes chunks of less than a megabyte, Foxglove of four.
+MAX_CHUNK_BYTES = 128 * 1024**2
+MAX_MESSAGE_BYTES = 128 * 1024**2
+# The footer with its places and checksum, and the magic bytes (mcap.dev/spec, "Footer (op=0x02)").
+_RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
+_MAX_METADATA_BYTES = 4 * 1024**2
+# What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
+_MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
+_OF_AN_ADDRESS = frozenset("%?#")
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+# No recording is packed a hundred times; one that is, and is large, was made to fill a disk.
+_MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
+
+
+DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or record it again"
+
+
+@contextmanager
+def translated(path: Path, remedy: str) -> Iterator[None]:
+    """Raise BagError for whatever the libraries say of a bag's bytes.
+
+    They raise what their parts raise: struct.error, ZstdError, RuntimeError, AssertionError, …
+    """
+    try:
+        yield
+    except BagError:
+        raise
+    except Exception as err:
+        raise BagError(
+            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {said(err)}; {remedy}"
+        ) from err
+
+
+_ROS_1_MAGIC = b"#ROSBAG V"
+_TABLES = (".csv", ".tsv", ".txt", ".npy", ".npz", ".mat", ".h5", ".hdf5", ".tdms")
+
+
+def check_kind(path: Path) -> None:
+    """Raise BagError for a file that becomes a bag of ours by ``omsm import`` alone."""
+    with open_regular(path, BagError, "bag") as stream:
+        of_ros_1 = stream.read(len(_ROS_1_MAGIC)) == _ROS_1_MAGIC
+    if of_ros_1 or path.suffix.lower() in _TABLES:
+        kind = "a bag of ROS 1" if of_ros_1 else "a table, no bag"
+        raise BagError(
+            f"{str(path)!r} is {kind}; make a bag of it: 'omsm import FILE --map MAP.yaml --out "
+            "BAG.mcap', where the map names its columns"
+        )
+
+
+def check_files(path: Path) -> None:
+    """Raise BagError unless ``path`` is a regular file or a folder of such."""
+    for part in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if not part.is_dir():
+            open_regular(part, BagError, "bag").close()
+        if part.suffix == ".db3" and set(str(part)) & _OF_AN_ADDRESS:
+            # rosbags makes an address of the path, and would read what lies elsewhere.
+            raise BagError(f"bag {str(part)!r} has one of '%?#' in its path; rename it")
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and metadata.stat().st_size > _MAX_METADATA_BYTES:
+        raise BagError(
+            f"bag {str(path)!r} has metadata of more than {_MAX_METADATA_BYTES} "
+            "bytes; record it again, in fewer files"
+        )
+
+
+def check_index(path: Path, reader: Reader) -> None:
+    """Raise BagError for an index whose chunks are too large, or the same one many times."""
+    storage = reader.storage
+    for part in getattr(storage, "storages", [storage]):
+        chunks = getattr(part, "chunks", [])
+        places = {chunk.chunk_start_offset for chunk in chunks}
+        largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
+        if len(places) < len(chunks) or largest > MAX_CHUNK_BYTES:
+            raise BagError(
+                f"bag {str(path)!r} has an index of {len(chunks)} chunks at {len(places)} places, "
+                f"the largest of {largest} bytes, expected each once and at most "
+                f"{MAX_CHUNK_BYTES} bytes; write it again with smaller chunks"
+            )
+
+
+def check_checksums(path: Path) -> None:
+    """Raise BagError if the index of an MCAP file does not fit its checksum, where it has one."""
+    for part in path.glob("*.mcap") if path.is_dir() else [path]:
+        if part.suffix == ".mcap":
+            with open_regular(part, BagError, "bag") as stream:
+                _check_checksum(part, stream)
+
+
+def _check_checksum(path: Path, stream: IO[bytes]) -> None:
+    end_at = stream.seek(-_END_BYTES, SEEK_END)
+    end = stream.read(_END_BYTES)
+    start, _, checksum = unpack_from("<QQI", end, _RECORD_HEAD_BYTES)
+    if not start or not checksum:
+        return
+    stream.seek(start)
+    index = stream.read(max(end_at - start, 0))
+    if crc32(index + end[:_CHECKED_END_BYTES]) != checksum:
+        raise BagError(f"bag {str(path)!r} has an index that does not fit its checksum: {DAMAGED}")
+
+
+def check_unpacked(path: Path, packed: int, unpacked: int) -> None:
+    """Raise BagError if bytes that were ``packed`` unpack to more than those of any recording."""
+    if unpacked > _MOST_PACKED * packed + _ALWAYS_UNPACKED_BYTES:
+        raise BagError(
+            f"bag {str(path)!r} unpacks to {_MOST_PACKED} times its {packed} bytes and more, which "
+            "no recording does; record it again without compression"
+        )
+
+
+def check_length_of_definitions(path: Path) -> None:
+    """Raise BagError for a ROS 2 bag whose definitions of messages take long to take apart."""
+    with Reader(path) as reader:
+        lines = sum(c.msgdef.data.count("\n") for c in reader.connections)
+    if lines > _MOST_DEFINITION_LINES:
+        raise BagError(
+            f"bag {str(path)!r} defines its messages in {lines} lines, at most "
+            f"{_MOST_DEFINITION_LINES} are read; record the topics that are needed alone"
+        )
+
+
+def check_definition(path: Path, connection: Connection, ours: Typestore) -> None:
+    """Raise BagError if the bag's definition of a message is not the one that we read it by."""
+    expected = ours.hash_rihs01(connection.msgtype)
+    if len(connection.msgdef.data) > _LONGEST_DEFINITION:  # too long to take apart; ours are short
+        connection = connection._replace(msgdef=_NO_DEFINITION, digest="too long to be one")
+    found = {connection.digest, _hash_of(connection.msgdef, connection.msgtype)} - {"", expected}
+    if found:
+        raise BagError(
+            f"{connection.topic!r} in {str(path)!r} was recorded with another definition of "
+            f"{connection.msgtype!r} ({found.pop()!r}, expected {expected!r}); record it again, or "
+            "convert it"
+        )
+
+
+@lru_cache(maxsize=64)
+def _hash_of(definition: MessageDefinition, name: str) -> str:
+    """Return RIHS01 of a definition that a bag carries; empty if it carries none."""
+    if definition.format is MessageDefinitionFormat.NONE:
+        return ""
+    store = get_typestore(Stores.EMPTY)
+    if definition.format is MessageDefinitionFormat.MSG:
+        store.register(get_types_from_msg(definition.data, name))
+    else:
+        store.register(get_types_from_idl(definition.data))
+    return store.hash_rihs01(name)
+
+
+def unpacked_message(data: bytes) -> bytes:
+    """Return a message that was compressed by itself; ReaderError if it is too long."""
+    return _zstd(data, MAX_MESSAGE_BYTES, exactly=False)
+
+
+def unpacked_chunk(data: bytes, compression: str, size: int, checksum: int) -> bytes:
+    """Return the records of a chunk; ReaderError if they are not ``size`` bytes, or changed."""
+    return storage_mcap.decompress(data, compression, size, checksum)
+
+
+def _zstd(data: bytes, size: int, exactly: bool = True) -> bytes:
+    return _bounded(storage_mcap.zstd.ZstdDecompressor().decompress, data, size, exactly)
+
+
+def _lz4(data: bytes, size: int) -> bytes:
+    return _bounded(LZ4FrameDecompressor().decompress, data, size, True)
+
+
+def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: bool) -> bytes:
+    if size > MAX_CHUNK_BYTES:
+        raise ReaderError(f"a chunk claims {size} bytes, at most {MAX_CHUNK_BYTES} are accepted")
+    raw = decompress(data, max_length=size + 1)
+    if len(raw) > size or (exactly and len(raw) < size):
+        raise ReaderError(f"a chunk claims {size} bytes and does not unpack to that many")
+    return raw
+
+
+class _Unpacked:
+    """A file of a folder that was compressed as a whole, read to a bound."""
+
+    def __init__(self, packed: IO[bytes], mode: str) -> None:
+        self._path, self._size = Path(packed.name), fstat(packed.fileno()).st_size
+        self._stream, self._read = storage_mcap.zstd.open(packed, mode), 0
+
+    def __enter__(self) -> _Unpacked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes; BagError where there are too many."""
+        part: bytes = self._stream.read(size)
+        self._read += len(part)
+        check_unpacked(self._path, self._size, self._read)
+        return part
+
+
+def _check_tables(base: Any) -> None:
+    """Raise BagError for a database in which a few bytes are computed into as many as one likes."""
+    base.limit(storage_sqlite3.apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+    computed = "SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) c WHERE c.hidden > 0"
+    for (name,) in base.execute(computed):
+        raise BagError(f"table {shown(name)} of the bag computes its columns; record it again")
+
+
+storage_sqlite3.apsw.connection_hooks.append(_check_tables)
+# rosbags unpacks whatever comes out, and looks at its size afterwards.
+storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
+bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)
+
+
+# Messages of an indexed MCAP file, a chunk at a time.
+#
+# rosbags makes two streams and reads five times for a message; of a long recording that took longer
+# than anything else that is done with its bytes. What is in a chunk is walked through here by the
+# lengths of its records (mcap.dev/spec, "Chunk (op=0x06)", "Message (op=0x05)").
+
+_MESSAGE = 0x05
+_RECORD = Struct("<BQ")  # kind, length of what follows
+_MESSAGE_HEAD = Struct("<HIQQ")  # channel, sequence, when it was recorded, when published
+_CHUNK_HEAD = Struct("<BQQQQI")  # record, first and last time, length unpacked, checksum
+# Between that and what is packed: length of the compression's name, the name, and its own length.
+_LENGTHS_BYTES = 4 + 8
+
+# When it was recorded, place of its chunk, connection, message.
+_Waiting: TypeAlias = "tuple[int, int, Connection, bytes]"
+_TIME, _PLACE = 0, 1
+_HANDED_ON = itemgetter(2, _TIME, 3)
+
+
+class ChunkReader(McapReader):  # type: ignore[misc]
+    """An MCAP file; one without index is read as rosbags does."""
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield ``(connection, when recorded [ns], message)`` by that time, then by their place.
+
+        start, stop: the first instant, and the first that is left out [ns]
+        """
+        if not self.chunks:
+            yield from super().messages(connections, start, stop)
+            return
+        wanted = {connection.id: connection for connection in connections}
+        waiting: list[_Waiting] = []
+        for chunk in sorted(
+            self.chunks, key=lambda c: (c.message_start_time, c.chunk_start_offset)
+        ):
+            begin, end = chunk.message_start_time, chunk.message_end_time + 1
+            first, last = (begin if start is None else start), (end if stop is None else stop)
+            if first >= end or begin >= last or not any(map(chunk.channel_count.get, wanted)):
+                continue
+            before = bisect_left(waiting, begin, key=itemgetter(_TIME))
+            yield from map(_HANDED_ON, waiting[:before])
+            waiting[:before] = self._within(chunk, wanted, first, last)
+            # Stable: those of one chunk and time stay in their order.
+            waiting.sort(key=itemgetter(_TIME, _PLACE))
+        yield from map(_HANDED_ON, waiting)
+
+    def _within(
+        self, chunk: Any, wanted: Mapping[int, Connection], first: int, last: int
+    ) -> Iterator[_Waiting]:
+        """Yield what a chunk holds on the ``wanted`` channels from ``first`` to before ``last``."""
+        records, place, at = self._records(chunk), chunk.chunk_start_offset, 0
+        while at < len(records):
+            kind, length = _RECORD.unpack_from(records, at)
+            body, at = at + _RECORD.size, at + _RECORD.size + length
+            if at > len(records):
+                raise ReaderError(f"a record of {length} bytes reaches beyond its chunk at {place}")
+            if kind == _MESSAGE:
+                if length < _MESSAGE_HEAD.size:
+                    raise ReaderError(f"a message of {length} bytes has no head")
+                channel, _, time, _ = _MESSAGE_HEAD.unpack_from(records, body)
+                if first <= time < last and channel in wanted:
+                    yield time, place, wanted[channel], records[body + _MESSAGE_HEAD.size : at]
+
+    def _records(self, chunk: Any) -> bytes:
+        assert self.bio is not None
+        self.bio.seek(chunk.chunk_start_offset)
+        checksum = _CHUNK_HEAD.unpack(self.bio.read(_CHUNK_HEAD.size))[-1]
+        self.bio.seek(_LENGTHS_BYTES + len(chunk.compression), SEEK_CUR)
+        packed = self.bio.read(chunk.compressed_size)
+        if len(packed) < chunk.compressed_size:
+            raise ReaderError(f"the chunk at {chunk.chunk_start_offset} was cut short")
+        unpacked: bytes = decompress(packed, chunk.compression, chunk.uncompressed_size, checksum)
+        return unpacked
+
+
+class _FolderReader(DirectoryReader):  # type: ignore[misc]
+    STORAGE_PLUGINS = DirectoryReader.STORAGE_PLUGINS | {"mcap": ChunkReader}
+
+
+class MessageReader(Reader):  # type: ignore[misc]
+    """rosbags' reader of files and folders, with the other reader of MCAP files."""
+
+    STORAGE_PLUGINS = Reader.STORAGE_PLUGINS | {".mcap": ChunkReader, "dir": _FolderReader}

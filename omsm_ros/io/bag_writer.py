@@ -1,0 +1,347 @@
+"""Writes bags: one bare ``.mcap`` file, which ``ros2 bag`` and Foxglove open as it is."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex, DataEnd, Footer
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, DistanceBlock
+from omsm_ros.errors import BagError
+from omsm_ros.io import message_mapping
+from omsm_ros.io.files import beside, make_folder, said
+from omsm_ros.io.message_mapping import bag_messages, typestore
+from omsm_ros.io.topics import (
+    ACCELERATION_TOPIC,
+    AXES_TOPIC,
+    DISTANCE_TOPIC,
+    LATCHED_DEPTH,
+    LATCHED_TOPICS,
+    SAMPLES_DEPTH,
+    TOPIC_TYPES,
+)
+
+# A recording that can be read at every moment at which it is not just being written to.
+#
+# MCAP readers look for the end of a file first (mcap.dev/spec, "Footer (op=0x02)"). So the end is
+# written behind every piece and overwritten by the next one. Whatever ends the writer between two
+# pieces leaves a whole file without an index, which readers scan; a full disk or a limit of size
+# leaves it too, for the place of the end was taken before.
+
+
+def _end_without_index() -> bytes:
+    builder = RecordBuilder()
+    DataEnd(data_section_crc=0).write(builder)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    return builder.end() + MCAP0_MAGIC
+
+
+END = _end_without_index()
+
+
+class GrowingFile:
+    """What an ``mcap.writer.Writer`` writes to; nothing is on the disk before :meth:`flush`.
+
+    OSError if the file exists (as a link, too), or cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._descriptor = os.open(path, flags, 0o666)
+        self._written = 0
+        self._waiting = bytearray()
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that are not on the disk yet."""
+        return len(self._waiting)
+
+    def write(self, data: bytes) -> None:
+        """Take the next bytes."""
+        self._waiting += data
+
+    def tell(self) -> int:
+        """Return the bytes taken so far."""
+        return self._written + len(self._waiting)
+
+    def flush(self) -> None:
+        """Write what waits, and an end; OSError if there is no room, and then none of it."""
+        self._append(END)
+
+    def complete(self) -> None:
+        """Write what waits, which has an end of its own; OSError as :meth:`flush`."""
+        self._append(b"")
+
+    def _append(self, end: bytes) -> None:
+        if not self._waiting:
+            return
+        piece, self._waiting = self._waiting, bytearray()
+        try:
+            self._put(piece + end)
+        except OSError:
+            if self._written:
+                self._put(END)
+                os.ftruncate(self._descriptor, self._written + len(END))
+            raise
+        self._written += len(piece)
+
+    def _put(self, data: bytes) -> None:
+        rest, place = memoryview(data), self._written
+        while rest:
+            count = os.pwrite(self._descriptor, rest, place)
+            rest, place = rest[count:], place + count
+
+    def close(self) -> None:
+        """Close the file once it is on the medium itself."""
+        try:
+            os.fsync(self._descriptor)
+        finally:
+            os.close(self._descriptor)
+
+
+# What a hard end costs is a chunk at most; smaller ones are slower to read.
+CHUNK_BYTES = 1024 * 1024
+_INDEX_PIECE_BYTES = 32 * 1024
+
+# In the form and words of rosbag2 9; the times are its infinity.
+_FOREVER = "{{sec: 9223372036, nsec: 854775807}}"
+_OFFERED_QOS = f"""\
+- history: keep_last
+  depth: {{depth}}
+  reliability: reliable
+  durability: {{durability}}
+  deadline: {_FOREVER}
+  lifespan: {_FOREVER}
+  liveliness: automatic
+  liveliness_lease_duration: {_FOREVER}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+class BagWriter:
+    """Writes one ``.mcap`` file in place: what was flushed can be read, whatever happens then.
+
+    Use it as a context manager; however it is left, the bag is readable.
+
+    path: a file that does not exist yet; BagError if it does, or cannot be made
+    topics: of the contract;  names: what the bag calls them, where not by the contract's name
+    """
+
+    def __init__(
+        self, path: Path | str, topics: Sequence[str], names: Mapping[str, str] | None = None
+    ) -> None:
+        self.path = Path(path)
+        self._names = {topic: (names or {}).get(topic, topic) for topic in topics}
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._taken = self._kept = 0
+        self._failed = False
+
+    def __enter__(self) -> BagWriter:
+        self._file = new_bag_file(self.path)
+        self._writer = new_writer(self._file)
+        for topic, name in self._names.items():
+            self._channels[topic] = self._channel(name, topic)
+        try:
+            with self._room():
+                self._file.flush()
+        except BagError:
+            self.path.unlink()
+            raise
+        return self
+
+    def _channel(self, name: str, topic: str) -> int:
+        kind, latched = TOPIC_TYPES[topic], topic in LATCHED_TOPICS
+        if kind not in self._schemas:
+            text, _ = typestore().generate_msgdef(kind, ros_version=2)
+            self._schemas[kind] = self._writer.register_schema(
+                kind, SchemaEncoding.ROS2, text.encode()
+            )
+        qos = _OFFERED_QOS.format(
+            depth=LATCHED_DEPTH if latched else SAMPLES_DEPTH,
+            durability="transient_local" if latched else "volatile",
+        )
+        metadata = {"offered_qos_profiles": qos, "topic_type_hash": typestore().hash_rihs01(kind)}
+        return self._writer.register_channel(
+            name, MessageEncoding.CDR, self._schemas[kind], metadata
+        )
+
+    def write_raw(
+        self, topic: str, stamp_ns: int, cdr: bytes | memoryview, published_ns: int | None = None
+    ) -> None:
+        """Append one message as it came over the wire, received at ``stamp_ns``.
+
+        BagError if there is no room for it, or for a stamp before 1970, which a bag cannot hold;
+        what was written before stays readable.
+        """
+        if self._failed:
+            return
+        published = stamp_ns if published_ns is None else published_ns
+        if (earliest := min(stamp_ns, published)) < 0:
+            raise BagError(
+                f"{topic!r}: the stamp {earliest} ns is before 1970, which no bag can hold; give "
+                "times since 1970, or a later start"
+            )
+        self._writer.add_message(self._channels[topic], stamp_ns, bytes(cdr), published)
+        self._taken += 1
+        if self._file.waiting:  # a chunk is full
+            self.flush()
+
+    def flush(self) -> None:
+        """Put all messages so far on the disk, readable; BagError if there is no room for them."""
+        if self._failed:
+            return
+        with self._room():
+            self._writer.flush()
+        self._kept = self._taken
+
+    @contextmanager
+    def _room(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as err:
+            self._failed = True
+            raise BagError(
+                f"recording ended, {str(self.path)!r} takes no more: {said(err)}; it is readable "
+                f"and holds the first {self._kept} messages, the last {self._taken - self._kept} "
+                "are lost; make room and record anew"
+            ) from err
+
+    def write(self, topic: str, stamp_ns: int, message: object) -> None:
+        """Append one message made of :func:`bag_messages`."""
+        self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
+
+    def write_axes(self, block: AxisBlock) -> None:
+        """Append a block of the axes at its own stamp."""
+        message = message_mapping.axis_message(bag_messages(), block)
+        self.write(AXES_TOPIC, block.stamp_ns, message)
+
+    def write_distance(self, block: DistanceBlock) -> None:
+        """Append a block of the probe at its own stamp."""
+        message = message_mapping.distance_message(bag_messages(), block)
+        self.write(DISTANCE_TOPIC, block.stamp_ns, message)
+
+    def write_acceleration(self, block: AccelerationBlock) -> None:
+        """Append a block of the accelerometer at its own stamp."""
+        message = message_mapping.acceleration_message(bag_messages(), block)
+        self.write(ACCELERATION_TOPIC, block.stamp_ns, message)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.flush()
+            if not self._failed:
+                with self._room():
+                    finish(self._writer, self._file)
+        finally:
+            with self._room():
+                self._file.close()
+
+
+@contextmanager
+def whole_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
+    """Yield the writer of a bag that appears when all went well, and not at all otherwise.
+
+    BagError if there is such a file, or no room for it.
+    """
+    if os.path.lexists(path):
+        raise _exists(path)
+    part = beside(path)
+    try:
+        with BagWriter(part, topics) as bag:
+            yield bag
+        part.rename(path)
+    except (BagError, OSError) as err:
+        cause = err.__cause__ if isinstance(err, BagError) else err
+        if not isinstance(cause, OSError):
+            raise
+        raise _not_writable(path, cause) from err
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def new_bag_file(path: Path) -> GrowingFile:
+    """Make a file for a bag; BagError if there is one, or none can be made."""
+    try:
+        make_folder(path.parent)
+        return GrowingFile(path)
+    except FileExistsError as err:
+        raise _exists(path) from err
+    except (OSError, ValueError) as err:
+        raise _not_writable(path, err) from err
+
+
+def next_free(path: Path) -> Path:
+    """Return ``path``, or the first of path.2, path.3, … before its suffix that is not there."""
+    tried, number = path, 1
+    while os.path.lexists(tried):
+        number += 1
+        tried = path.with_name(f"{path.stem}.{number}{path.suffix}")
+    return tried
+
+
+def _exists(path: Path) -> BagError:
+    return BagError(
+        f"{str(path)!r} exists and is not overwritten; give another name, or move it away"
+    )
+
+
+def _not_writable(path: Path, err: Exception) -> BagError:
+    return BagError(
+        f"cannot write {str(path)!r}: {said(err)}; check the folder, its rights and its room"
+    )
+
+
+def new_writer(file: GrowingFile) -> Writer:
+    """Begin an MCAP file of ROS 2, with checksums; samples of a probe do not compress."""
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
+    # It keeps an object of a kilobyte for each chunk: of two a second, 200 MB a day.
+    writer._Writer__chunk_indices = _PackedIndex()  # type: ignore[attr-defined]
+    writer.start(Profile.ROS2, "omsm_ros")
+    return writer
+
+
+class _PackedIndex:
+    """The index of the chunks as the bytes that it will be, in place of a list of its records.
+
+    Compressed: a quarter of a megabyte an hour.
+    """
+
+    def __init__(self) -> None:
+        self._builder, self._recent = RecordBuilder(), bytearray()
+        self._packed: list[bytes] = []
+
+    def append(self, index: ChunkIndex) -> None:
+        """Take the record of one more chunk."""
+        index.write(self._builder)
+        self._recent += self._builder.end()
+        if len(self._recent) >= _INDEX_PIECE_BYTES:
+            self._packed.append(zlib.compress(self._recent))
+            self._recent = bytearray()
+
+    def __iter__(self) -> Iterator[_PackedIndex]:
+        yield self
+
+    def write(self, stream: RecordBuilder) -> None:
+        """Write all records."""
+        for piece in self._packed:
+            stream.write(zlib.decompress(piece))
+        stream.write(bytes(self._recent))
+
+
+def finish(writer: Writer, file: GrowingFile) -> None:
+    """Write the index; OSError if there is no room for it, and the bag is readable without."""
+    writer.finish()
+    file.complete()

@@ -1,0 +1,214 @@
+"""``CAL.json``: a calibration as a file, its schema and its id checked."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.core.calibration import calibration as plausibility
+from omsm_ros.core.calibration.calibration import SCHEMA, Calibration, content_id
+from omsm_ros.core.calibration.calibration_set import (
+    AXES,
+    MOST_MEMBERS,
+    SET_SCHEMA,
+    set_from_content,
+)
+from omsm_ros.errors import CalibrationError, FileError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import beside, read_text, said, save_json
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.units import NANOSECONDS_PER_S
+
+MAX_CALIBRATION_BYTES = 4_000_000
+
+_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 64}
+_PROPERTIES = {
+    "schema": {"const": SCHEMA},
+    "id": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "numerator": _COEFFICIENTS,
+    "denominator": _COEFFICIENTS,
+    "delay": NUMBER,
+    "static_gain": NUMBER,
+    "sample_period": NUMBER,
+    "valid_up_to": NUMBER,
+    "covariance": {"type": "array", "items": NUMBER, "maxItems": 16384},
+    "settings": {"type": "object"},
+    "certificate": {"type": "object"},
+}
+_FORM = form(_PROPERTIES, tuple(_PROPERTIES))
+
+
+_MEMBER = form({"position": NUMBER, "calibration": _FORM}, ("position", "calibration"))
+_SET_PROPERTIES = {
+    "schema": {"const": SET_SCHEMA},
+    "id": _PROPERTIES["id"],
+    "along": {"enum": list(AXES)},
+    "members": {"type": "array", "items": _MEMBER, "maxItems": MOST_MEMBERS},
+    "certificate": {"type": "object"},
+}
+_SET_FORM = form(_SET_PROPERTIES, tuple(_SET_PROPERTIES))
+
+
+def save_calibration(path: Path | str, calibration: Calibration) -> None:
+    """Write ``CAL.json`` (schema "omsm-calibration/1"), or a set of them."""
+    save_json(path, {"id": calibration.id, **calibration.content()})
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read ``CAL.json``, or a set of them; CalibrationError if malformed, altered, implausible."""
+    return _calibration_in(_text_of(path), path)
+
+
+def load_for_others(path: Path | str) -> Calibration:
+    """Read ``CAL.json`` for who may not see the file; no error shows what stands in it.
+
+    Raises CalibrationError.
+    """
+    text = _text_of(path)
+    try:
+        return _calibration_in(text, path)
+    except CalibrationError:
+        # Without its cause, which would be in the log that everybody can subscribe to.
+        raise CalibrationError(
+            f"{str(path)!r} is there, but no calibration that can be used; on that computer, "
+            f"'omsm compare {str(path)!r} {str(path)!r}' says why"
+        ) from None
+
+
+def _text_of(path: Path | str) -> str:
+    return read_text(path, MAX_CALIBRATION_BYTES, CalibrationError, "calibration")
+
+
+def _calibration_in(text: str, path: Path | str) -> Calibration:
+    what = f"calibration {str(path)!r}"
+    return calibration_of(json_and_yaml.object_of(text, CalibrationError, what), what)
+
+
+def calibration_of(content: dict[str, Any], what: str) -> Calibration:
+    """Return the calibration, or the set, of a file's ``content``, which messages call ``what``.
+
+    Raises CalibrationError if it is malformed, altered or implausible.
+    """
+    is_set = content.get("schema") == SET_SCHEMA
+    check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
+    try:
+        return _set_of(content) if is_set else _calibration_of(content)
+    except CalibrationError as err:
+        raise CalibrationError(f"{what}: {err}") from err
+
+
+def _calibration_of(content: dict[str, Any]) -> Calibration:
+    _check_id(content)
+    return Calibration.from_content(content)
+
+
+def _set_of(content: dict[str, Any]) -> Calibration:
+    _check_id(content)
+    plausibility.check_certificate(content["certificate"])
+    members = [_calibration_of(dict(member["calibration"])) for member in content["members"]]
+    return set_from_content(content, members)
+
+
+def _check_id(content: dict[str, Any]) -> None:
+    """Take the id away from ``content``, and raise CalibrationError if it is not its own."""
+    stored = content.pop("id")
+    if stored != content_id(content):
+        raise CalibrationError(
+            f"it was altered after it was made: id {stored!r} does not match its content "
+            f"{content_id(content)!r}; identify it again"
+        )
+
+
+# Where calibrations are kept: none is ever overwritten, and a link names the one in force.
+
+_ID_CHARACTERS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFolder:
+    """``cal.json``, a link to the calibration in force, beside ``cal.TIME.ID.json``, one for each.
+
+    TIME: UTC, when it came into force;  ID: the first characters of the calibration's id
+    """
+
+    link: Path
+
+    def put(self, calibration: Calibration, since_ns: int) -> Path:
+        """Keep a calibration that is in force since ``since_ns`` [ns]; return its file.
+
+        A file that holds it already is linked again. Raises FileError.
+        """
+        self._keep_what_is_no_link()
+        short = calibration.id[:_ID_CHARACTERS]
+        kept = sorted(self.link.parent.glob(f"{self.link.stem}.*.{short}{self.link.suffix}"))
+        target = kept[-1] if kept else self._named(since_ns, short)
+        if not kept:
+            save_calibration(target, calibration)
+        self._point_at(target, since_ns)
+        return target
+
+    def in_force(self) -> tuple[Calibration, int] | None:
+        """Return the calibration that the link names and since when [ns]; None without one.
+
+        Raises CalibrationError if the file cannot be used.
+        """
+        if not os.path.lexists(self.link):
+            return None
+        return load_calibration(self.link), since(self.link)
+
+    def _named(self, since_ns: int, short: str) -> Path:
+        when = datetime.fromtimestamp(since_ns / NANOSECONDS_PER_S, timezone.utc)
+        name = f"{self.link.stem}.{when:%Y%m%dT%H%M%SZ}.{short}{self.link.suffix}"
+        return self.link.with_name(name)
+
+    def _keep_what_is_no_link(self) -> None:
+        """Rename a calibration that stands where the link belongs, as it was made before."""
+        if self.link.is_symlink() or not self.link.is_file():
+            return
+        old, since_ns = load_calibration(self.link), self.link.stat().st_mtime_ns
+        os.replace(self.link, self._named(since_ns, old.id[:_ID_CHARACTERS]))
+
+    def _point_at(self, target: Path, since_ns: int) -> None:
+        part = beside(self.link)
+        try:
+            part.symlink_to(target.name)
+            os.utime(part, ns=(since_ns, since_ns), follow_symlinks=False)
+            os.replace(part, self.link)
+        except OSError as err:
+            part.unlink(missing_ok=True)
+            raise FileError(
+                f"cannot link {str(self.link)!r} to {target.name!r}: {said(err)}; check the folder"
+            ) from err
+
+
+def since(path: Path) -> int:
+    """Return since when a calibration is in force that ``path``, a file or a link, names [ns].
+
+    Raises CalibrationError if there is none.
+    """
+    try:
+        return os.lstat(path).st_mtime_ns
+    except (OSError, ValueError) as err:
+        raise CalibrationError(f"no calibration at {str(path)[:200]!r}: {said(err)}") from err
+
+
+def confined(path: Path, folders: str) -> Path:
+    """Return ``path`` resolved; CalibrationError unless it lies below one of ``folders``.
+
+    folders: separated by ":", as in PATH; "~" is the home folder, "." the working directory;
+        empty = anywhere
+    """
+    try:
+        resolved = path.expanduser().resolve()
+        allowed = [Path(each).expanduser().resolve() for each in folders.split(":") if each]
+    except (OSError, ValueError, RuntimeError) as err:
+        raise CalibrationError(f"no calibration at {str(path)[:200]!r}; check the path") from err
+    if allowed and not any(resolved.is_relative_to(folder) for folder in allowed):
+        raise CalibrationError(
+            f"{str(path)[:200]!r} lies outside the folders that calibrations are loaded from, "
+            f"{folders!r}; put it there, or start with another calibration_folders"
+        )
+    return resolved

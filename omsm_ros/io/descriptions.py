@@ -1,0 +1,278 @@
+"""``GEOMETRY.yaml``, ``LIMITS.yaml``, ``PITCH.csv``: the probe's place, the machine's limits."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import yaml
+
+from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
+from omsm_ros.core.correction.source_kinds import KINDS
+from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface
+from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import GridSurface, as_grid
+from omsm_ros.core.surface.nominal import SHAPES
+from omsm_ros.core.surface.posed import Pose, PosedSurface
+from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import read_text, save_text
+from omsm_ros.io.json_and_yaml import NUMBER, as_number, check_form, form
+from omsm_ros.io.table_file import load_columns
+from omsm_ros.quantities import PITCH, POSITION, SAMPLE_PERIOD, TIME, shown
+
+MAX_YAML_BYTES = 100_000
+
+_T = TypeVar("_T")
+
+
+def load_geometry(path: Path | str) -> Geometry:
+    """Read ``GEOMETRY.yaml``: where the probe sits and looks, in metres and slopes."""
+    values = _read_mapping(path, "geometry")
+    return _made(Geometry, values, f"geometry {str(path)!r}")
+
+
+def load_limits(path: Path | str) -> MachineLimits:
+    """Read ``LIMITS.yaml``: what servo, probe, spindle and axes can do, units in the names."""
+    values = _read_mapping(path, "limits")
+    return _made(MachineLimits, values, f"limits {str(path)!r}")
+
+
+def load_pitch(path: Path | str) -> PitchCurve:
+    """Read ``PITCH.csv``: columns ``z_m,pitch_rad``, as an autocollimator along Z measures it."""
+    z, angle = load_columns(path, ("z_m", "pitch_rad"))
+    what = f"pitch {str(path)!r}"
+    POSITION.checked_all(z, FileError, f"{what}: z_m")
+    PITCH.checked_all(angle, FileError, f"{what}: pitch_rad")
+    try:
+        return PitchCurve(z, angle)
+    except ConfigurationError as err:
+        raise FileError(f"{what}: {err}") from err
+
+
+def save_geometry(path: Path | str, geometry: Geometry) -> None:
+    """Write ``GEOMETRY.yaml``."""
+    save_text(path, yaml.safe_dump(asdict(geometry), sort_keys=False))
+
+
+def _made(kind: Callable[..., _T], values: Mapping[str, Any], what: str) -> _T:
+    """Return a record of numbers made of ``values``, which must have its fields' names."""
+    parameters = fields(kind)  # type: ignore[arg-type]
+    required = [field.name for field in parameters if field.default is MISSING]
+    check_form(values, form({p.name: NUMBER for p in parameters}, required), FileError, what)
+    try:
+        return kind(**values)
+    except ConfigurationError as err:
+        raise FileError(f"{what}: {err}") from err
+
+
+def _read_mapping(path: Path | str, what: str) -> dict[str, Any]:
+    text = read_text(path, MAX_YAML_BYTES, FileError, what)
+    return json_and_yaml.mapping_of(text, FileError, f"{what} {str(path)!r}")
+
+
+# A planned motion as CSV.
+
+
+def load_motion(path: Path | str) -> tuple[FloatArray, float]:
+    """Read a planned motion, columns ``time_s`` and ``z_m`` of a CSV: z [m] and its period [s].
+
+    Raises FileError for a table without these columns, or times that are not even.
+    """
+    time, z = load_columns(path, ("time_s", "z_m"))
+    what = f"motion {str(path)!r}"
+    TIME.checked_all(time, FileError, f"{what}: time_s")
+    POSITION.checked_all(z, FileError, f"{what}: z_m")
+    steps = np.diff(time)
+    period = SAMPLE_PERIOD.checked(float(np.mean(steps)), FileError, f"{what}: step of time_s")
+    if np.ptp(steps) > 0.01 * period:
+        raise FileError(
+            f"{what}: time_s runs in steps of {steps.min():g} to {steps.max():g} s, "
+            "expected even steps; sample the motion evenly"
+        )
+    return z, period
+
+
+# ``SOURCES.yaml``: what is uncertain of the machine, one statement a source.
+#
+# schema: omsm-sources/1
+# sources:
+#   - {source: tilt, value: 5.0e-6, unit: rad, how: declared, reason: dial gauge at the rim}
+#   - {source: spindle_axial, per_turn: 2, value: 8.0e-9, unit: m, distribution: arcsine,
+#      how: evaluated, reason: ball and capacitive sensor}
+
+SCHEMA = "omsm-sources/1"
+MAX_BYTES = 100_000
+_MOST_SOURCES = 200
+_TEXT = {"type": "string"}
+_OWN = {"source": _TEXT, "value": NUMBER, "unit": _TEXT, "how": _TEXT, "reason": _TEXT}
+_PARAMETERS = {key: NUMBER for kind in KINDS.values() for key in kind.parameters}
+_ITEM = form({**_OWN, "distribution": _TEXT, **_PARAMETERS}, tuple(_OWN))
+_FORM = form(
+    {
+        "schema": {"const": SCHEMA},
+        "sources": {"type": "array", "items": _ITEM, "maxItems": _MOST_SOURCES},
+    },
+    ("schema", "sources"),
+)
+
+
+def load_sources(path: Path | str) -> MachineSources:
+    """Read ``SOURCES.yaml``; FileError naming the source and what is wrong with it."""
+    what = f"sources {str(path)!r}"
+    content = json_and_yaml.mapping_of(
+        read_text(path, MAX_BYTES, FileError, "sources"), FileError, what
+    )
+    check_form(content, _FORM, FileError, what)
+    try:
+        return MachineSources(tuple(_stated(item) for item in content["sources"]))
+    except ConfigurationError as err:
+        raise FileError(f"{what}: {err}") from err
+
+
+def _stated(item: Mapping[str, Any]) -> StatedSource:
+    own = {name: item[name] for name in (*_OWN, "distribution") if name in item}
+    unit = own.pop("unit")
+    stated = StatedSource(**own, parameters={k: v for k, v in item.items() if k in _PARAMETERS})
+    expected = KINDS[stated.source].quantity.unit or "1" if stated.source in KINDS else "m"
+    if unit != expected:
+        raise ConfigurationError(f"{stated.source} is stated in {unit!r}, expected {expected!r}")
+    return stated
+
+
+# ``SURFACE.yaml``: what a part should be.
+#
+# ``shape`` and the parameters of that shape under the names of its fields, in metres and radians; a
+# ``pose`` if the part does not sit at the origin of the machine. The schema is read off the fields
+# of the shape's record, so that a new shape has its own without a line here.
+
+# Every shape is evaluated at every point; what is in a turned frame, by Newton's method, some five
+# times for once, and so twenty-five times where its frame is turned in another one.
+MOST_SHAPES, MOST_FRAMES = 50, 3
+_GRID = "grid"
+_INTEGER: Mapping[str, Any] = {"type": "integer"}
+_LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
+
+
+def load_surface(path: Path | str) -> Surface:
+    """Read ``SURFACE.yaml``; SurfaceError if it is malformed."""
+    text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
+    what = f"surface {str(path)!r}"
+    description = json_and_yaml.mapping_of(text, SurfaceError, what)
+    shapes, frames = _extent(description)
+    if shapes > MOST_SHAPES or frames > MOST_FRAMES:
+        raise SurfaceError(
+            f"{what} has {shapes} shapes and {frames} turned frames within one another, expected "
+            f"at most {MOST_SHAPES} and {MOST_FRAMES}; describe it by a grid"
+        )
+    return surface_of(description, what, Path(path).parent)
+
+
+def _extent(content: Any) -> tuple[int, int]:
+    """Return how many shapes a description has, and how many frames are turned in one another."""
+    named = content if isinstance(content, dict) else {}
+    inside = named.values() if named else content if isinstance(content, list) else ()
+    known = [_extent(part) for part in inside]
+    shapes = sum(count for count, _ in known) + ("shape" in named)
+    turned = ("pose" in named) + ("parent" in named)
+    return shapes, turned + max((depth for _, depth in known), default=0)
+
+
+def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = None) -> Surface:
+    """Return the surface of a description, which messages call ``what``.
+
+    folder: where the files that it names are sought; None: it may name none
+    """
+    values = dict(description)
+    shape, pose = values.pop("shape", None), values.pop("pose", None)
+    named = {"shape": shape} if shape is not None else {}
+    known = sorted([*SHAPES, *([_GRID] if folder is not None else [])])
+    check_form(named, form({"shape": {"enum": known}}, ("shape",)), SurfaceError, what)
+    if shape == _GRID:
+        surface = _grid(values, f"{what}: {shape}", folder or Path())
+    else:
+        surface = _record(SHAPES[shape], values, f"{what}: {shape}", folder)
+    if pose is None:
+        return surface
+    return PosedSurface(surface, _value(Pose, pose, f"{what}: pose", folder))
+
+
+def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
+    """Return the surface of a map in a file of any known format."""
+    # Here, because readers of maps take longer to load than a scan to correct.
+    from omsm_ros.io.maps.read_map import read_points
+    from omsm_ros.units import units_of
+
+    schema = form({"file": {"type": "string"}, "unit": {"type": "string"}}, ("file",))
+    check_form(values, schema, SurfaceError, what)
+    try:
+        units = units_of(values["unit"]) if "unit" in values else None
+        grid = as_grid(read_points(folder / values["file"], units))
+        if grid is None:
+            raise DataError(
+                "its points are no evenly spaced rows and columns; make such a map of them with "
+                "'omsm export --spacing'"
+            )
+        return GridSurface(grid)
+    except (FileError, DataError) as err:
+        raise SurfaceError(f"{what}: {err}") from err
+
+
+def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None) -> Any:
+    """Return a record of ``kind`` made of ``values`` under the names of its fields."""
+    known = [each for each in fields(kind) if each.init]
+    hints = get_type_hints(kind)
+    required = [each.name for each in known if each.default is MISSING]
+    schema = form({each.name: _schema(hints[each.name]) for each in known}, required)
+    check_form(values, schema, SurfaceError, what)
+    made = {n: _value(hints[n], v, f"{what}: {n}", folder) for n, v in values.items()}
+    try:
+        return kind(**made)
+    except (ConfigurationError, SurfaceError) as err:
+        raise SurfaceError(f"{what}: {err}") from err
+
+
+def _schema(hint: Any) -> Mapping[str, Any]:
+    """Return what JSON may stand for a value of this type."""
+    if _choices(hint):
+        return {"enum": list(_choices(hint))}
+    if get_origin(hint) is tuple:
+        return _LIST
+    return {int: _INTEGER, float: NUMBER}.get(_present(hint), {})
+
+
+def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
+    """Return the foreign ``value`` as one of the type ``hint``."""
+    if value is None and _present(hint) is not hint:
+        return None
+    kind = _present(hint)
+    if get_origin(kind) is tuple:
+        each = get_args(kind)[0]
+        return tuple(_value(each, v, f"{what}[{k}]", folder) for k, v in enumerate(value))
+    if kind is float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise SurfaceError(f"{what} is {shown(value)}, expected a number{as_number(value)}")
+        return float(value)
+    if kind is Surface or is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise SurfaceError(f"{what} is {shown(value)}, expected names and values")
+        if kind is Surface:
+            return surface_of(value, what, folder)
+        return _record(kind, value, what, folder)
+    return value
+
+
+def _present(hint: Any) -> Any:
+    """Return the type of a value that may also be absent."""
+    if get_origin(hint) in (types.UnionType, Union):
+        return next(kind for kind in get_args(hint) if kind is not types.NoneType)
+    return hint
+
+
+def _choices(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) is Literal else ()

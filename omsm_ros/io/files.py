@@ -1,0 +1,143 @@
+"""Regular files, read up to a bound; files that appear only when they are whole."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from omsm_ros.errors import FileError, shortened
+from omsm_ros.io import json_and_yaml
+
+CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
+SYSTEMATIC = "systematic.npz"
+FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
+"""The files of a measurement."""
+SPECTRUM, DIFFERENCE, EXPERIMENT = "spectrum.json", "difference.json", "experiment.json"
+
+# What says what is in the way of a file has room for it, and for the words around it.
+_LONGEST_NAME = 120
+
+
+# What libraries raise of files that they take for whole; the words are those of their own code.
+_OF_A_LIBRARY = (LookupError, TypeError, AttributeError, RecursionError, AssertionError)
+
+
+def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
+    """Return the text of a regular file of at most ``limit`` bytes.
+
+    Raises ``error``, which calls the file ``what``, for anything else.
+    """
+    try:
+        with open_regular(path, error, what) as stream:
+            raw = stream.read(limit + 1)
+        if raw is None:  # of the kernel's own files, some give lines as they come
+            raise BlockingIOError("there is nothing to read now")
+        if len(raw) <= limit:
+            return raw.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        raise error(
+            f"{what} {str(path)!r} cannot be read as text: {said(err)}; give a text in UTF-8"
+        ) from err
+    raise error(
+        f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "
+        "check the path"
+    )
+
+
+def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:
+    """Open a regular file for reading; ``error`` for a folder, a device, a pipe, or none at all."""
+    try:
+        # Without O_NONBLOCK the opening of a pipe waits for a writer that may never come.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError as err:
+        raise error(f"no {what} at {str(path)!r}; check the path") from err
+    except (OSError, ValueError) as err:
+        raise error(f"{what} {str(path)!r} cannot be read: {said(err)}; check the path") from err
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise error(
+            f"{what} {str(path)!r} cannot be read: it is no regular file but a folder, a device "
+            "or a pipe; give a file"
+        )
+    return os.fdopen(descriptor, "rb")
+
+
+def said(err: Exception) -> str:
+    """Return what an exception says, on one line, without the path that a message names."""
+    if isinstance(err, MemoryError):
+        return "it asks for more memory than there is"
+    if isinstance(err, _OF_A_LIBRARY):
+        return "what it holds does not fit together"
+    text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
+    return " ".join(text.split())[:200] or type(err).__name__
+
+
+@contextmanager
+def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open ``path`` for writing under a temporary name; rename it when all went well.
+
+    The temporary name cannot be foreseen, and nothing that exists is opened: neither a second
+    writer's file nor a link that somebody laid. FileError if it cannot be written there.
+    """
+    target = Path(path)
+    part: Path | None = None
+    try:
+        make_folder(target.parent)
+        if target.exists() and not target.is_file():  # replacing /dev/null would break the machine
+            raise FileExistsError(None, "it is a folder, a device or a pipe")
+        part = beside(target)
+        with open(part, mode, opener=_new_file) as stream:
+            yield stream
+        os.replace(part, target)
+    except (OSError, ValueError) as err:
+        if isinstance(err, ValueError) and part is not None:
+            raise
+        raise FileError(
+            f"cannot write {str(target)!r}: {said(err)}; check the folder, its rights and its room"
+        ) from err
+    finally:
+        if part is not None:
+            part.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; NotADirectoryError names the file that is in the way."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as err:
+        for above in (path, *path.parents):
+            if os.path.lexists(above):
+                name = shortened(repr(str(above)), _LONGEST_NAME)
+                raise NotADirectoryError(None, f"{name} is in the way, no folder") from err
+        raise
+
+
+def beside(target: Path) -> Path:
+    """Return a name that nobody can foresee, in the folder of ``target``."""
+    # Not made from the target's name, which may have all the characters that a name can have.
+    return target.with_name(f".{secrets.token_hex(8)}.part")
+
+
+def _new_file(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+
+
+def save_bytes(path: Path | str, content: bytes) -> None:
+    """Write a file."""
+    with whole_file(path) as stream:
+        stream.write(content)
+
+
+def save_text(path: Path | str, text: str) -> None:
+    """Write a text file."""
+    save_bytes(path, text.encode("utf-8", "replace"))
+
+
+def save_json(path: Path | str, content: Mapping[str, object]) -> None:
+    """Write a JSON object for people and programs; ValueError for what JSON cannot say."""
+    save_text(path, json_and_yaml.text_of(content, indent=1) + "\n")

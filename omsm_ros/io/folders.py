@@ -1,0 +1,220 @@
+"""A folder of results: put in place together, all of one run or none of it; and read again."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import (
+    CLOUD,
+    CURVES,
+    DEVIATION,
+    DIFFERENCE,
+    EXPERIMENT,
+    FORM,
+    REPORT,
+    SPECTRUM,
+    SUMMARY,
+    SYSTEMATIC,
+    beside,
+    make_folder,
+    read_text,
+    said,
+)
+
+FORM_FILES = (DEVIATION, CURVES, REPORT, FORM)
+MEASUREMENT_FILES = (CLOUD, SYSTEMATIC, *FORM_FILES, SUMMARY)
+EXPERIMENT_FILES = (*MEASUREMENT_FILES, EXPERIMENT)
+
+# Results that have a name in common. An experiment may hold a measurement, that its form.
+_RESULTS = {
+    EXPERIMENT: EXPERIMENT_FILES,
+    SUMMARY: MEASUREMENT_FILES,
+    FORM: FORM_FILES,
+    SPECTRUM: (REPORT, SPECTRUM),
+    DIFFERENCE: (REPORT, DIFFERENCE),
+}
+# A summary of ours has tens of kilobytes.
+MAX_RESULT_BYTES = 10_000_000
+
+
+@contextmanager
+def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty private folder; put its files into ``path`` at once when all went well.
+
+    names: of the files that make a result; those of an earlier run go. The last of them says
+        that the result is whole: it is taken away first and comes last, so that nobody ever
+        sees it beside files of another run. Other files in ``path`` stay; one that this run
+        makes beside its result replaces only that of an earlier run.
+
+    FileError if it cannot be written there, or where the result of another command is that has
+    files of these names; then, as after any exception, ``path`` is unchanged.
+    """
+    target = Path(os.path.abspath(path))
+    staged: Path | None = None
+    try:
+        try:
+            make_folder(target.parent)
+            if target.exists() and not target.is_dir():
+                raise NotADirectoryError(None, "it is a file; give a folder")
+            _refuse_foreign(target, names)
+            staged = beside(target)
+            staged.mkdir()
+        except (OSError, ValueError) as err:
+            raise _refusal(path, err) from err
+        yield staged
+        try:
+            _put_in_place(staged, target, names)
+        except (OSError, ValueError) as err:
+            raise _refusal(path, err) from err
+    finally:
+        if staged is not None:
+            shutil.rmtree(staged, ignore_errors=True)
+
+
+def _refusal(path: Path | str, err: Exception) -> FileError:
+    if isinstance(err, FileError):
+        return err
+    return FileError(
+        f"cannot write results into {str(path)!r}: {said(err)}; check the folder, its rights and "
+        "its room"
+    )
+
+
+def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
+    if not target.exists():
+        try:
+            staged.rename(target)
+        except OSError:
+            if not target.is_dir():
+                raise
+        else:
+            return
+        # Another writer came first: what follows replaces its files.
+    again = (target / names[-1]).is_file()
+    for part in staged.iterdir():
+        if (target / part.name).is_dir():
+            raise IsADirectoryError(None, f"{part.name!r} there is a folder; remove it")
+        if part.name not in names and (target / part.name).exists() and not again:
+            raise FileExistsError(
+                None, f"{part.name!r} is there and no result; give another folder"
+            )
+    lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one writer after the other
+        _refuse_foreign(target, names)
+        for name in reversed(names):
+            (target / name).unlink(missing_ok=True)
+        for part in sorted(staged.iterdir(), key=lambda part: part.name == names[-1]):
+            part.replace(target / part.name)
+    finally:
+        os.close(lock)
+
+
+def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
+    """Raise FileError where the folder holds another command's result with files of these names."""
+    found = next((mark for mark in _RESULTS if (target / mark).is_file()), names[-1])
+    if found != names[-1] and not set(names).isdisjoint(_RESULTS[found]):
+        raise FileError(
+            f"{str(target)!r} holds the result of another command ({found}), whose files would "
+            "be mixed with these; give another folder"
+        )
+
+
+def read_result(path: Path, what: str) -> dict[str, Any]:
+    """Return the object in a JSON file of results, such as ``summary.json``, called ``what``.
+
+    FileError where it is not there, too large, or no JSON object.
+    """
+    text = read_text(path, MAX_RESULT_BYTES, FileError, what)
+    return json_and_yaml.object_of(text, FileError, f"{what} {str(path)!r}")
+
+
+# A folder of the user's own for what lives as long as a process: links to emulated ports.
+
+_MODE = 0o700
+
+
+def runtime_folder(namespace: str = "") -> Path:
+    """Return a private folder, made if need be: ``$XDG_RUNTIME_DIR/omsm_ros`` and below.
+
+    namespace: of the cell, a folder of its own for each
+    Without that variable it lies in the system's temporary folder and carries the user's number.
+    Raises FileError if somebody else's folder, or a link, stands there.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR", "")
+    folder = (
+        Path(base) / "omsm_ros" if os.path.isdir(base) else Path(f"/tmp/omsm_ros-{os.getuid()}")
+    )
+    _make_own(folder)
+    for part in namespace.strip("/").split("/"):
+        if part:
+            folder /= part
+            _make_own(folder)
+    return folder
+
+
+def _make_own(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
+        found = os.lstat(folder)
+    except OSError as err:
+        raise FileError(
+            f"cannot make folder {str(folder)!r}: {said(err)}; check its rights"
+        ) from err
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise FileError(
+            f"{str(folder)!r} is not a private folder of this user: others could put something "
+            "else in its place; remove it, or set XDG_RUNTIME_DIR"
+        )
+
+
+# Two emulators do not offer one port, two calibrators keep no one file: the second is refused.
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """Hold ``path``, which need not exist, for this process alone.
+
+    The system lets go of it however the process ends. Raises ConfigurationError if another one
+    holds it or it names no file, FileError if its folder cannot be written.
+    """
+    if path.name in ("", ".."):
+        raise ConfigurationError(f"{str(path)!r} names no file; give a name in a folder")
+    lock = path.with_name(f".{path.name[-200:]}.lock")
+    try:
+        held = _locked(lock)
+    except BlockingIOError as err:
+        raise ConfigurationError(
+            f"{str(path)!r} is in use by another process; end it, or give another name"
+        ) from err
+    except OSError as err:
+        raise FileError(f"cannot hold {str(path)!r}: {said(err)}; check its folder") from err
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(held)
+
+
+def _locked(lock: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+    while True:
+        held = os.open(lock, flags, 0o600)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Who ended meanwhile took the file's name away.
+            if lock.exists() and os.path.samestat(os.fstat(held), os.stat(lock)):
+                return held
+        except BlockingIOError:
+            os.close(held)
+            raise
+        os.close(held)

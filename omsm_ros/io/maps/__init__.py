@@ -1,0 +1,1 @@
+"""Maps and point clouds of other programs."""

@@ -1,0 +1,329 @@
+"""Text with a column each for x, y and height: ``.xyz``, ``.asc``, ``.csv``, ``.txt``."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import open_regular, read_text, whole_file
+from omsm_ros.io.table_file import rows_in
+from omsm_ros.quantities import MAP_POINTS
+from omsm_ros.units import LengthUnits, metres_in, name_and_unit, needed, refuse_other
+
+# As many points as a map may have, in lines of sixty characters.
+MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
+_COMMENTS = ("#", "!", "%")
+_LONGEST_HEADER, _LONGEST_LINE = 50, 10_000
+_ROLES = {
+    "x": "x",
+    "y": "y",
+    "z": "height",
+    "height": "height",
+    "sag": "height",
+    "uncertainty": "uncertainty",
+    "u": "uncertainty",
+    "sample": "sample",
+}
+_PORTION = 100_000
+
+
+def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    """Read a text of points; its units from its header, or ``units`` where it names none.
+
+    Raises FileError for a text that is no table of points, or names no unit and none is given.
+    """
+    what = f"map {str(path)!r}"
+    with open_regular(path, FileError, "map") as stream:
+        if (size := stream.seek(0, io.SEEK_END)) > MAX_TEXT_BYTES:
+            raise FileError(f"{what} has {size} bytes, at most {MAX_TEXT_BYTES} are read; thin it")
+        stream.seek(0)
+        header, first = _beginning(stream, what)
+        names, scales, cells = _columns(header, first, units, what)
+        stream.seek(0)
+        body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
+        table = _numbers(body, len(header), first, cells, sorted(names.values()), what)
+    at = {name: sorted(names.values()).index(place) for name, place in names.items()}
+    column = {name: table[:, place] * scales[name] for name, place in at.items()}
+    return measured(
+        column["x"],
+        column["y"],
+        column["height"],
+        column.get("uncertainty"),
+        _notes(names, cells),
+        sample=column.get("sample"),
+    )
+
+
+def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
+    """Return the lines before the first line of numbers, and that line."""
+    header: list[str] = []
+    # Old Macs end lines with CR alone, which bytes do not know; detached, it leaves stream open.
+    text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="surrogateescape")
+    lines = [*islice(iter(lambda: text.readline(_LONGEST_LINE), ""), _LONGEST_HEADER)]
+    text.detach()
+    for raw in lines:
+        line = _decoded(raw.encode("utf-8", "surrogateescape")).strip()
+        if line and not line.startswith(_COMMENTS) and _all_numbers(line):
+            return header, line
+        header.append(line)
+    raise FileError(
+        f"{what} has no line of numbers among its first {_LONGEST_HEADER}; give a text with a "
+        "column each for x, y and height"
+    )
+
+
+def _decoded(raw: bytes) -> str:
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:  # a µ as Windows writes it
+        return raw.decode("latin-1")
+
+
+def _all_numbers(line: str) -> bool:
+    parts = [part for part in re.split(r"[,;\s]+", line) if part]
+    try:
+        [float(part) for part in parts]
+    except ValueError:
+        return False
+    return bool(parts)
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ";," if mark in line), None)
+
+
+def _cells(line: str) -> tuple[int, int]:
+    """Return how many cells a line of numbers has, without and with empty ones at its end."""
+    mark = _delimiter(line)
+    full = line.rstrip(f" {mark}") if mark else line
+    return len(full.split(mark)), len(line.split(mark))
+
+
+def _columns(
+    header: list[str], first: str, units: LengthUnits | None, what: str
+) -> tuple[dict[str, int], dict[str, float], int]:
+    """Return place and metres in one number of each column by its role, and cells in a line."""
+    named, count = _roles(header, _cells(first), what)
+    places = {role: place for role, (place, _) in named.items()}
+    if not named:
+        if count < 3:
+            raise FileError(
+                f"{what} has {count} columns, expected x, y and height in each line; write it again"
+            )
+        places = {"x": 0, "y": 1, "height": 2}
+    stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
+    scales = dict.fromkeys(places, 1.0)
+    for role in places:
+        if role == "sample":
+            continue
+        if role in stated:
+            scales[role] = stated[role]
+            _agreed(units, role, stated[role], what)
+        else:
+            given = needed(units, what)
+            scales[role] = given.lateral if role in "xy" else given.height
+    return places, scales, count
+
+
+def _agreed(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
+    """Refuse a column whose name states another unit than was given."""
+    if units is None:
+        return
+    own = (stated, units.height) if role in "xy" else (units.lateral, stated)
+    refuse_other(units, LengthUnits(*own), what)
+
+
+def _roles(
+    header: list[str], cells: tuple[int, int], what: str
+) -> tuple[dict[str, tuple[int, float | None]], int]:
+    """Return place and unit of each column by its role, none if no line names them, and the cells.
+
+    Raises FileError where the line of names has more or fewer than the numbers have columns, names
+    one twice, or states another unit than a line of units below it.
+    """
+    for place in reversed(range(len(header))):
+        names = _names(header[place])
+        found = _named(names)
+        if not {"x", "y", "height"} <= set(found):
+            continue
+        if not cells[0] <= len(names) <= cells[1]:
+            if header[place].startswith(_COMMENTS):  # words that happen to be such names
+                continue
+            raise FileError(
+                f"{what}: line {place + 1} names {len(names)} columns, below it stand numbers in "
+                f"{cells[0]}; name each column once, and write decimal points"
+            )
+        for role, (at, _) in found.items():
+            if names.count(names[at]) > 1 or sum(name_and_unit(n)[0] == role for n in names) > 1:
+                raise FileError(f"{what} has the column {names[at]!r} twice; name each once")
+        return _with_units(found, header[place + 1 :], what), len(names)
+    return {}, cells[0]
+
+
+def _names(line: str) -> list[str]:
+    """Return the cells of what may be a line of names; an empty one counts between delimiters."""
+    text = line.lstrip("#!% ").replace("/t", "\t").rstrip(" ,;\t")
+    if _delimiter(text):
+        return [part.strip().strip('"') for part in re.split("[,;]", text)]
+    parts = [part.strip() for part in text.split("\t") if part.strip()]
+    return parts if len(parts) >= 3 else re.sub(r"\s+(?=[\[(])", "", text).split()
+
+
+def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
+    """Return place and unit by role, of the columns that have one."""
+    found: dict[str, tuple[int, float | None]] = {}
+    for place, (name, unit) in enumerate(map(name_and_unit, names)):
+        role = _ROLES.get(name)
+        # A cloud of ours has its height twice, and "height" is the one of full precision.
+        if role and (role not in found or name == "height"):
+            found[role] = (place, unit)
+    return found
+
+
+def _with_units(
+    found: dict[str, tuple[int, float | None]], below: list[str], what: str
+) -> dict[str, tuple[int, float | None]]:
+    """Return ``found`` with the units of a line of units, if one stands below the names."""
+    for line in below:
+        units = [metres_in(name.strip("[]() ")) for name in _names(line)]
+        for role, (place, own) in found.items():
+            stated = units[place] if place < len(units) else None
+            if own is not None and stated is not None and stated != own:
+                raise FileError(
+                    f"{what} states two units of {role}, by its name and on the line below it; "
+                    "delete the wrong one"
+                )
+            found[role] = (place, stated if own is None else own)
+    return found
+
+
+def _numbers(
+    body: io.TextIOBase, above: int, first: str, cells: int, columns: list[int], what: str
+) -> FloatArray:
+    remedy = (
+        "write decimal points, a height that is missing as nan, and the same columns on every line"
+    )
+    layout = {"comments": list(_COMMENTS), "delimiter": _delimiter(first), "usecols": columns}
+    lines = islice(body, above, None)
+    return rows_in(lines, what, remedy, above=above, cells=cells, **layout)
+
+
+def _notes(names: Mapping[str, int], count: int) -> tuple[str, ...]:
+    return (f"{count - len(names)} other columns were left out",) if count > len(names) else ()
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv: bool) -> None:
+    """Write columns (n,) of one length by their names, as CSV or, for xyz, after a ``#`` line."""
+    mark = "," if csv else " "
+    with whole_file(path, "w") as stream:
+        stream.write(("" if csv else "# ") + mark.join(columns) + "\n")
+        for portion in _portions(columns):
+            np.savetxt(stream, portion, fmt=_formats(columns), delimiter=mark)
+
+
+def _formats(columns: Mapping[str, NDArray[np.generic]]) -> list[str]:
+    """Return formats with as many digits as each kind of number holds."""
+    return [
+        "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
+        for part in columns.values()
+    ]
+
+
+def _portions(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[NDArray[np.float64]]:
+    count = len(next(iter(columns.values())))
+    for start in range(0, count, _PORTION):
+        yield np.column_stack([part[start : start + _PORTION] for part in columns.values()])
+
+
+# Profiles of the DABAM collection: columns in ``NAME.dat``, what they are in ``NAME.txt``.
+#
+# ``FILE_FORMAT`` 1 has slopes in the second column, 2 heights; 3 and 4 the same in pairs of
+# columns.
+# Further columns (residuals) are derived, and are left out.
+
+_MAX_HEADER_BYTES = 100_000
+_MAX_DATA_BYTES = 200_000_000
+_SLOPES, _HEIGHTS = (1, 3), (2, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DabamProfile:
+    """A profile as it was stored.
+
+    position: [m], (n,);  value: heights [m] or slopes [rad], (n,)
+    slopes: whether ``value`` is slopes
+    header: what the text beside it says
+    """
+
+    position: FloatArray
+    value: FloatArray
+    slopes: bool
+    header: Mapping[str, Any]
+
+
+def has_dabam_header(path: Path) -> bool:
+    """Tell whether a text beside ``path`` describes it as a profile of DABAM."""
+    beside = path.with_suffix(".txt")
+    if path.suffix.lower() != ".dat" or beside == path or not beside.is_file():
+        return False
+    try:
+        return "FILE_FORMAT" in _header(beside)
+    except FileError:
+        return False
+
+
+def _header(path: Path) -> dict[str, Any]:
+    text = read_text(path, _MAX_HEADER_BYTES, FileError, "header")
+    return json_and_yaml.object_of(text, FileError, f"header {str(path)!r}")
+
+
+def load_dabam(path: Path) -> DabamProfile:
+    """Read columns and header; FileError where they do not fit each other."""
+    what = f"profile {str(path)!r}"
+    header = _header(path.with_suffix(".txt"))
+    form, skip = header.get("FILE_FORMAT"), header.get("FILE_HEADER_LINES")
+    factors = [header.get(key) for key in ("X1_FACTOR", "Y1_FACTOR")]
+    numbers = [n for n in factors if isinstance(n, float | int) and n > 0]
+    known = form in (*_SLOPES, *_HEIGHTS) and isinstance(skip, int) and 0 <= skip <= 1000
+    if not known or len(numbers) != 2:
+        raise FileError(
+            f"{what}: its header says FILE_FORMAT {form!r}, FILE_HEADER_LINES {skip!r}, factors "
+            f"{factors!r}; expected 1 to 4, a count, and numbers above zero"
+        )
+    with open_regular(path, FileError, "profile") as stream:
+        lines = stream.read(_MAX_DATA_BYTES).decode("utf-8", "replace").splitlines()[skip:]
+    table = rows_in(lines, what, "check FILE_HEADER_LINES", above=skip, usecols=(0, 1))
+    if not len(table):
+        raise FileError(
+            f"{what} has no points after its {skip} lines of header; check FILE_HEADER_LINES"
+        )
+    position, value = (table[:, i] * float(numbers[i]) for i in (0, 1))
+    return DabamProfile(position, value, form in _SLOPES, header)
+
+
+def read_dabam(path: Path) -> MeasuredPoints:
+    """Read a profile as points along x at y = 0; slopes are integrated by the trapezoidal rule.
+
+    Raises FileError where columns and header do not fit each other.
+    """
+    profile = load_dabam(path)
+    height, notes = profile.value, ("a profile along x",)
+    if profile.slopes:
+        # Here, because to load it takes half a second, and every map passes through this module.
+        from scipy.integrate import cumulative_trapezoid
+
+        height = cumulative_trapezoid(profile.value, profile.position, initial=0.0)
+        notes = ("a profile along x; its slopes were integrated",)
+    return measured(profile.position, np.zeros_like(height), height, notes=notes)

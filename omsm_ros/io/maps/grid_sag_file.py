@@ -1,0 +1,143 @@
+"""Grid sag of optical design programs (Zemax OpticStudio ``.DAT``).
+
+First line: columns, rows, spacing in x and y, unit (0 mm, 1 cm, 2 inch, 3 m), decentre in x and y.
+Then a line a point: height, its three derivatives, and a flag that is not zero where there is no
+datum. The first point is at the least x and the greatest y; x runs first, then y falls.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular, whole_file
+from omsm_ros.io.table_file import rows_in
+from omsm_ros.quantities import MAP_POINTS
+from omsm_ros.units import LengthUnits, refuse_other
+
+_UNITS_M = (1e-3, 1e-2, 0.0254, 1.0)
+_METRES = 3
+# Height alone, with its derivatives, and with the flag.
+_NUMBERS_OF_A_POINT = (1, 4, 5)
+_COMMENT = "!"
+_LONGEST_LINE = 10_000
+
+
+def is_grid_sag(first: str, second: str) -> bool:
+    """Tell whether the first two lines of a text, comments left out, are those of a grid sag file.
+
+    One of an unknown unit is one, too, where its second line shows that it is no table.
+    """
+    numbers = _first_line(first)
+    if numbers is None:
+        return False
+    lengths = len(second.split()), len(first.split())
+    return _has_unit(numbers) or lengths[1] != lengths[0] in _NUMBERS_OF_A_POINT
+
+
+def _first_line(text: str) -> tuple[float, ...] | None:
+    try:
+        numbers = tuple(float(part) for part in text.split())
+    except ValueError:
+        return None
+    if len(numbers) not in (5, 7) or not np.all(np.isfinite(numbers)):
+        return None
+    whole = all(n == int(n) >= 5 for n in numbers[:2]) and numbers[4] == int(numbers[4])
+    return numbers if whole and min(abs(numbers[2]), abs(numbers[3])) > 0 else None
+
+
+def _has_unit(first: tuple[float, ...]) -> bool:
+    return first[4] in range(len(_UNITS_M))
+
+
+def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
+    """Read a grid sag file; a point flagged "no data" is missing.
+
+    units: what the reader takes the file for, if anything
+
+    Raises FileError for a file of other lines, of fewer or more points than it says, or of other
+    ``units``.
+    """
+    what = f"grid sag {str(path)!r}"
+    with open_regular(path, FileError, "grid sag") as stream:
+        text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
+        line, above = text.readline(_LONGEST_LINE), 1
+        while line.startswith(_COMMENT) or line.isspace():
+            line, above = text.readline(_LONGEST_LINE), above + 1
+        first = _first_line(line)
+        if first is None:
+            raise FileError(
+                f"{what} must begin with columns, rows (5 or more), two spacings, unit and "
+                "decentres"
+            )
+        if not _has_unit(first):
+            raise FileError(
+                f"{what} has unit {int(first[4])}, the fifth number of its first line, expected "
+                "0 (mm), 1 (cm), 2 (inch) or 3 (m); correct it"
+            )
+        scale = _UNITS_M[int(first[4])]
+        refuse_other(units, LengthUnits(scale, scale), what)
+        columns, rows = int(first[0]), int(first[1])
+        MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
+        table = rows_in(text, what, "write a line a point", above=above, comments=_COMMENT)
+    if len(table) != columns * rows:
+        raise FileError(
+            f"{what} says {columns} × {rows} points and has {len(table)}; write it again"
+        )
+    return _grid(first, table)
+
+
+def _grid(first: tuple[float, ...], table: FloatArray) -> HeightGrid:
+    columns, rows, dx, dy, unit = (
+        int(first[0]),
+        int(first[1]),
+        abs(first[2]),
+        abs(first[3]),
+        first[4],
+    )
+    decentre = first[5:] or (0.0, 0.0)
+    scale = _UNITS_M[int(unit)]
+    height = table[:, 0] * scale
+    if table.shape[1] > 4:
+        height = np.where(table[:, 4] != 0, np.nan, height)
+    return HeightGrid(
+        height=np.flipud(height.reshape(rows, columns)),
+        x0=(decentre[0] - dx * (columns - 1) / 2) * scale,
+        y0=(decentre[1] - dy * (rows - 1) / 2) * scale,
+        dx=dx * scale,
+        dy=dy * scale,
+    )
+
+
+def write_grid_sag(path: Path, grid: HeightGrid) -> None:
+    """Write a map in metres, with the derivatives that it has inside and zeros elsewhere.
+
+    Raises FileError for fewer than five rows or columns, which readers refuse.
+    """
+    rows, columns = grid.height.shape
+    if min(rows, columns) < 5:
+        raise FileError(
+            f"a grid sag file has 5 × 5 points or more, this map {columns} × {rows}; "
+            "give a smaller --spacing"
+        )
+    slope_x, slope_y, twist = _derivatives(grid)
+    missing = ~np.isfinite(grid.height)
+    parts = [np.where(missing, 0.0, grid.height), slope_x, slope_y, twist, missing]
+    table = np.column_stack([np.flipud(part).ravel() for part in parts])
+    centre = (grid.x0 + grid.dx * (columns - 1) / 2, grid.y0 + grid.dy * (rows - 1) / 2)
+    head = (columns, rows, *(f"{v:.17g}" for v in (grid.dx, grid.dy)), _METRES)
+    with whole_file(path, "w") as stream:
+        stream.write(" ".join(map(str, (*head, *(f"{v:.17g}" for v in centre)))) + "\n")
+        np.savetxt(stream, table, fmt=["%.17g", "%.9g", "%.9g", "%.9g", "%d"])
+
+
+def _derivatives(grid: HeightGrid) -> tuple[FloatArray, ...]:
+    """Return the slopes and twist by central differences; zero where a neighbour is missing."""
+    slope_y, slope_x = np.gradient(grid.height, grid.dy, grid.dx)
+    twist = np.gradient(slope_x, grid.dy, axis=0)
+    return tuple(np.nan_to_num(part, nan=0.0) for part in (slope_x, slope_y, twist))

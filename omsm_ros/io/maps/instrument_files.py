@@ -1,0 +1,228 @@
+"""HDF5: our own tables of points, and the maps of Zygo Mx (``.datx``)."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular, said, whole_file
+from omsm_ros.io.optional_libraries import library, walked
+from omsm_ros.quantities import MAP_POINTS, shown
+from omsm_ros.units import LengthUnits, metres_in, needed, refuse_other
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+SCHEMA = "omsm-points/1"
+_NO_LENGTHS = ("sample", "intensity")
+_DATX_SURFACES = "Data/Surface"
+
+
+def read_hdf5(path: Path) -> MeasuredPoints:
+    """Read a table of ours, or the first surface of a ``.datx``; both carry their units.
+
+    Raises FileError for other HDF5 files, and for those that are damaged.
+    """
+    what = f"HDF5 file {str(path)!r}"
+    h5py = library("h5py", what)
+    with open_regular(path, FileError, "HDF5 file") as stream:
+        walked(path, what)
+        try:
+            with h5py.File(stream, "r") as content:
+                if content.attrs.get("schema") == SCHEMA:
+                    return _table(content, what)
+                if _DATX_SURFACES in content:
+                    return _datx(h5py, content, what)
+        except FileError:
+            raise
+        except Exception as err:  # whatever the library makes of a damaged file
+            raise FileError(f"{what} cannot be read: {said(err)}; write it again") from err
+    raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
+
+
+def _table(content: Any, what: str) -> MeasuredPoints:
+    column: dict[str, NDArray[Any]] = {}
+    for name in ("x", "y", "height", "uncertainty", "sample"):
+        if name in content:
+            column[name] = _array(content[name], what, 1)
+    if gone := {"x", "y", "height"} - set(column):
+        raise FileError(f"{what} has no column {min(gone)!r}; write it again")
+    lengths = {name: len(values) for name, values in column.items()}
+    if len(set(lengths.values())) > 1:
+        raise FileError(f"{what} has columns of different lengths {lengths}; write it again")
+    return measured(
+        column["x"],
+        column["y"],
+        column["height"],
+        column.get("uncertainty"),
+        sample=column.get("sample"),
+    )
+
+
+def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
+    shape = getattr(dataset, "shape", ())
+    if len(shape) != axes:
+        raise FileError(f"{what} holds an array of shape {shape!r}, expected {axes} of them")
+    if dataset.dtype.kind not in "fiu":
+        raise FileError(f"{what} holds an array of {shown(str(dataset.dtype))}, expected numbers")
+    MAP_POINTS.checked(math.prod(shape), FileError, f"{what}: number of points")
+    return np.asarray(dataset[()])
+
+
+def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
+    group = content[_DATX_SURFACES]
+    surfaces = [group[name] for name in group if isinstance(group[name], h5py.Dataset)]
+    if not surfaces:
+        raise FileError(f"{what} holds no surface; save it with one")
+    surface = surfaces[0]
+    height = _array(surface, what, 2).astype(np.float64)
+    no_data = surface.attrs.get("No Data")
+    if no_data is not None:
+        height[height >= float(np.ravel(no_data)[0])] = np.nan
+    dx, dy = (_pixel(surface, f"{axis} Converter", what) for axis in "XY")
+    # The first row is the upper one of the camera.
+    scaled = np.flipud(height) * _datx_scale(surface, what)
+    notes = (f"the first of its {len(surfaces)} surfaces",) if len(surfaces) > 1 else ()
+    return HeightGrid(height=scaled, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
+
+
+def _datx_scale(surface: Any, what: str) -> float:
+    """Return the length of one unit of the heights [m]."""
+    unit = np.ravel(surface.attrs["Unit"])[0]
+    name = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    if (metres := metres_in(name)) is not None:
+        return metres
+    if name.lower() not in ("fringes", "waves", "fringewaves"):
+        raise FileError(f"{what} has heights in {name!r}, expected a length or fringes")
+    keys = ("Wavelength", "Interferometric Scale Factor", "Obliquity Factor")
+    return float(np.prod([np.ravel(surface.attrs[key])[0] for key in keys]))
+
+
+def _pixel(surface: Any, key: str, what: str) -> float:
+    """Return the distance of pixels [m]: the second number of a converter from pixels."""
+    category, base, *_, numbers = np.ravel(surface.attrs[key])[0]
+    if (category, base) != (b"LateralCat", b"Pixels") or not numbers[1] > 0:
+        raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
+    return float(numbers[1])
+
+
+def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:
+    """Write columns (n,) as datasets with their ``units``, lengths in metres."""
+    h5py = library("h5py", f"writing {str(path)!r}")
+    with whole_file(path, "w+b") as stream, h5py.File(stream, "w") as content:
+        content.attrs["schema"] = SCHEMA
+        content.attrs["comment"] = comment
+        for name, values in columns.items():
+            dataset = content.create_dataset(name, data=values)
+            dataset.attrs["units"] = "1" if name in _NO_LENGTHS else "m"
+
+
+# Zygo MetroPro binary maps (``.dat``), after the layout that Zygo publishes with the program.
+
+MAGIC_METROPRO_FILE = b"\x88\x1b\x03"
+_HEADER_BYTES = 834
+_LARGEST_HEADER = 65_536
+# Phase values from here on say why there is none.
+_NO_DATUM = 2_147_483_640
+# Steps of the phase in one fringe, by the entry "phase resolution".
+_STEPS = {0: 4096, 1: 32768, 2: 131072}
+
+
+def read_metropro(path: Path) -> MeasuredPoints:
+    """Read the phase map as heights; the first row is the upper one.
+
+    height = phase · wavelength · scale factor · obliquity / steps
+
+    Raises FileError for a file that is none, was cut short, or lacks phase or its scales.
+    """
+    what = f"MetroPro file {str(path)!r}"
+    with open_regular(path, FileError, "MetroPro file") as stream:
+        head = stream.read(_HEADER_BYTES)
+        if len(head) < _HEADER_BYTES or not head.startswith(MAGIC_METROPRO_FILE):
+            raise FileError(f"{what} has no header of MetroPro, or was cut short; save it again")
+        size = _at(">I", head, 6)
+        columns, rows = _at(">H", head, 68), _at(">H", head, 70)
+        before = _at(">H", head, 52) * _at(">H", head, 54) * _at(">H", head, 56) * 2
+        if size > _LARGEST_HEADER:
+            raise FileError(f"{what} says that its header has {size} bytes; save it again")
+        MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
+        stream.seek(size + before)
+        raw = stream.read(4 * columns * rows)
+        held = stream.seek(0, io.SEEK_END)
+    if len(raw) < 4 * columns * rows:
+        raise FileError(
+            f"{what} has {held} bytes, too few for {columns} × {rows} points; save it again"
+        )
+    phase = np.frombuffer(raw, ">i4").reshape(rows, columns).astype(np.float64)
+    return _points(head, phase, what)
+
+
+def _points(head: bytes, phase: FloatArray, what: str) -> MeasuredPoints:
+    steps = _STEPS.get(_at(">h", head, 218))
+    factors = [_at(">f", head, place) for place in (164, 168, 176)]
+    if steps is None or not np.all(np.isfinite(factors)) or min(map(abs, factors)) <= 0:
+        raise FileError(f"{what} does not say how high a fringe is; export it again with its scale")
+    scale = float(np.prod(factors)) / steps
+    notes: tuple[str, ...] = ()
+    if _at(">h", head, 232):
+        scale, notes = -scale, ("its sign entry says 'inverted': the heights were negated",)
+    pixel = _at(">f", head, 184)
+    if not (np.isfinite(pixel) and pixel > 0):
+        raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
+    height = np.where(phase >= _NO_DATUM, np.nan, phase * scale)
+    grid = HeightGrid(height=np.flipud(height), x0=0.0, y0=0.0, dx=pixel, dy=pixel)
+    return grid.points(notes)
+
+
+def _at(form: str, head: bytes, place: int) -> Any:
+    """Return the entry at ``place`` of the header."""
+    return struct.unpack_from(form, head, place)[0]
+
+
+# Formats of other instruments, by the library SurfaceTopography.
+
+MAX_FOREIGN_BYTES = 1_000_000_000
+
+
+def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    """Read a map by whatever reader of SurfaceTopography knows it; ``units`` where it has none.
+
+    Raises FileError where none knows it, or it is no map of two directions.
+    """
+    what = f"map {str(path)!r}"
+    open_regular(path, FileError, "map").close()
+    if path.stat().st_size > MAX_FOREIGN_BYTES:
+        raise FileError(f"{what} has more than {MAX_FOREIGN_BYTES} bytes; convert it to xyz")
+    topography = library("SurfaceTopography", what)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what the file lacks; we ask for it ourselves
+            with topography.open_topography(str(path)) as reader:
+                found = reader.topography()
+            height = np.ma.filled(np.ma.asarray(found.heights(), np.float64), np.nan)
+    except Exception as err:  # a reader of forty formats fails in as many ways
+        raise FileError(f"{what} is of no known format, convert it to xyz: {said(err)}") from err
+    if height.ndim != 2 or found.physical_sizes is None:
+        raise FileError(f"{what} is no map with its size; convert it to xyz")
+    metres = metres_in(str(found.unit)) if found.unit else None
+    if metres:
+        refuse_other(units, LengthUnits(metres, metres), what)
+    scale = LengthUnits(metres, metres) if metres else needed(units, what)
+    dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
+    return HeightGrid(
+        height=height.T * scale.height,
+        x0=0.0,
+        y0=0.0,
+        dx=dx * scale.lateral,
+        dy=dy * scale.lateral,
+    ).points((f"read by SurfaceTopography as {type(reader).__name__}",))

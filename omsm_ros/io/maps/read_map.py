@@ -1,0 +1,93 @@
+"""Which format is this file? Read it as points in metres."""
+
+from __future__ import annotations
+
+import codecs
+from dataclasses import replace
+from pathlib import Path
+
+from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.io.files import CLOUD, open_regular, said
+from omsm_ros.io.maps import instrument_files
+from omsm_ros.io.maps.columns_file import has_dabam_header, read_columns, read_dabam
+from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
+from omsm_ros.io.maps.instrument_files import read_foreign
+from omsm_ros.io.maps.vertex_file import read_pcd, read_ply
+from omsm_ros.io.maps.x3p_file import read_x3p
+from omsm_ros.units import NOT_USED, LengthUnits
+
+_HEAD_BYTES = 4096
+_BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V")
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_GRID_SAG_SUFFIXES = (".dat", ".grd")
+_TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
+
+
+def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
+    """Read a map or cloud of any known format, known by its content; a folder is a result of ours.
+
+    units: of a file that does not carry them itself
+
+    Raises FileError for a file that is of no known format, is damaged, or needs ``units``.
+    """
+    file = path / CLOUD if path.is_dir() else path
+    try:
+        return _read(file, units)
+    except DataError as err:
+        raise FileError(f"map {str(file)!r}: {err}") from err
+    except OSError as err:
+        raise FileError(f"map {str(file)!r} cannot be read: {said(err)}; check the path") from err
+
+
+def _head(path: Path) -> bytes:
+    """Return how a file begins; refuse one that is empty, or a bag."""
+    with open_regular(path, FileError, "map") as stream:
+        head = stream.read(_HEAD_BYTES)
+    if not head:
+        raise FileError(f"map {str(path)!r} is empty; write it again")
+    if head.startswith(_BAGS):
+        raise FileError(
+            f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
+            "'omsm form' its --calibration, too; one of ROS 1 needs 'omsm import' first"
+        )
+    if head.startswith(_UTF_16):
+        raise FileError(f"map {str(path)!r} is text in UTF-16; save it as UTF-8")
+    return head
+
+
+def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    head = _head(path)
+    if head.startswith((b"ply\n", b"ply\r\n")):
+        return read_ply(path, units)
+    if head.startswith((b"# .PCD", b"VERSION")):
+        return read_pcd(path, units)
+    if (found := _in_metres(path, head)) is not None:
+        # Their layout fixes what they count in: nothing can contradict it.
+        unasked = (NOT_USED,) if units else ()
+        return replace(found, notes=(*found.notes, *unasked))
+    text, suffix = b"\0" not in head, path.suffix.lower()
+    if text and suffix in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
+        return read_grid_sag(path, units).points()
+    if text and suffix in _TEXT_SUFFIXES:
+        return read_columns(path, units)
+    return read_foreign(path, units)
+
+
+def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
+    """Read a file of a format that fixes its units; None for any other."""
+    if head.startswith(instrument_files.MAGIC_METROPRO_FILE):
+        return instrument_files.read_metropro(path)
+    if head.startswith(instrument_files.MAGIC):
+        return instrument_files.read_hdf5(path)
+    if path.suffix.lower() == ".x3p":
+        return read_x3p(path)
+    return read_dabam(path) if has_dabam_header(path) else None
+
+
+def _first_lines(head: bytes) -> tuple[str, str]:
+    """Return the first two lines that are neither empty nor comments, empty where there is none."""
+    lines = head.decode("utf-8-sig", "replace").splitlines()
+    data = [line for line in lines if line.strip() and not line.startswith("!")]
+    first, second = (*data[:2], "", "")[:2]
+    return first, second

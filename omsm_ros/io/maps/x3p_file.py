@@ -1,0 +1,128 @@
+"""x3p (ISO 25178-72): a map, a profile or a cloud with its axes, in metres.
+
+Written in the revision ``ISO5436 - 2000``, which every reader takes.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.height_grid import HeightGrid
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular, said, whole_file
+from omsm_ros.io.optional_libraries import library
+from omsm_ros.quantities import MAP_POINTS
+
+# All points that are read, in eight bytes each, and what describes them.
+MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
+
+_REVISION = re.compile(rb"<(?:[\w.-]+:)?Revision>([^<]*)<")
+# Letters and digits of a revision, and its text in the standard.
+_REVISIONS = {
+    b"iso54362000": b"ISO5436 - 2000",
+    b"iso25178722017": b"ISO5436 - 2000",
+    b"iso25178722017dam1": b"ISO25178-72:2017/DAM1",
+    b"iso25178722017amd12020": b"ISO25178-72:2017/DAM1",
+}
+
+# Types of heights that an increment makes lengths of.
+_WHOLE = ("I", "L")
+
+
+def read_x3p(path: Path) -> MeasuredPoints:
+    """Read the first layer of an x3p file, in its global frame.
+
+    Raises FileError for a file that is none, is damaged, or unpacks to more than is read.
+    """
+    what = f"x3p file {str(path)!r}"
+    x3pio = library("x3pio", what)
+    with open_regular(path, FileError, "x3p file") as stream:
+        try:
+            with zipfile.ZipFile(stream) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+                if size > MAX_UNPACKED_BYTES:
+                    raise FileError(
+                        f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
+                        "thin it"
+                    )
+                known = _with_known_revision(archive)
+            stream.seek(0)
+            content = x3pio.read(known or stream)
+            place = _places(x3pio, content)
+        except FileError:
+            raise
+        except Exception as err:  # whatever zip, XML and heights make of a damaged file
+            raise FileError(f"{what} cannot be read: {said(err)}; save it again") from err
+    layers = len(content.layers)
+    notes = (f"the first of its {layers} layers",) if layers > 1 else ()
+    return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
+
+
+def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
+    """Return the archive with the spelling of its revision that x3pio knows; None if it has it.
+
+    The standards fix the text, and programs write their own: ISO5436_2000, ISO25178-72:2017.
+    """
+    main = archive.read("main.xml")
+    found = _REVISION.search(main)
+    bare = re.sub(rb"[^a-z0-9]", b"", found[1].lower()) if found else b""
+    if found is None or bare not in _REVISIONS or found[1].strip() == _REVISIONS[bare]:
+        return None
+    spelled = BytesIO()
+    with zipfile.ZipFile(spelled, "w") as made:
+        for member in archive.infolist():
+            # What it says of main.xml no longer holds.
+            if member.filename.endswith("md5checksum.hex"):
+                continue
+            content = archive.read(member)
+            if member.filename == "main.xml":
+                content = main[: found.start(1)] + _REVISIONS[bare] + main[found.end(1) :]
+            made.writestr(member.filename, content)
+    spelled.seek(0)
+    return spelled
+
+
+def _places(x3pio: Any, content: Any) -> FloatArray:
+    """Return x, y, height (n, 3) [m] of the first layer; NaN = missing."""
+    layer, header = content.layers[0], content.header
+    # Left out, it counts as one: heights in steps of a metre, which no instrument has.
+    if header.z.data_type.value in _WHOLE and header.z.increment == 1.0:
+        raise ValueError("its heights are whole numbers without an increment; save it with one")
+    if isinstance(content, x3pio.PointCloud):
+        places = np.asarray(layer.points(), np.float64)
+    elif not header.x.is_incremental or (np.ndim(layer.z) == 2 and not header.y.is_incremental):
+        raise ValueError("its places are listed one by one; save it with even spacings")
+    else:
+        height = np.atleast_2d(np.asarray(layer.z, np.float64))
+        dx = header.x.increment
+        dy = header.y.increment if np.ndim(layer.z) == 2 else dx
+        grid = HeightGrid(height=height, x0=0.0, y0=0.0, dx=dx, dy=dy)
+        x, y = np.meshgrid(grid.x, grid.y)
+        places = np.column_stack([x.ravel(), y.ravel(), height.ravel()])
+    if content.placement is None:
+        return places
+    return np.asarray(content.placement.apply(places), np.float64)
+
+
+def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
+    """Write a map [m] with its place as x3p of the revision that all readers take."""
+    x3pio = library("x3pio", f"writing {str(path)!r}")
+    surface = x3pio.Surface.from_array(
+        grid.height,
+        x_scale=grid.dx,
+        y_scale=grid.dy,
+        placement=x3pio.Placement(offset=(grid.x0, grid.y0, 0.0)),
+        coordinate_system=x3pio.CoordinateSystem.VIEW,
+        revision=x3pio.Revision.ISO5436_2000,
+    )
+    named = surface.with_metadata(manufacturer="omsm_ros", model="omsm_ros", comment=comment)
+    with whole_file(path) as stream:
+        named.save(stream)

@@ -1,0 +1,389 @@
+"""The one mapping between messages on the wire and records of the core.
+
+The same field names hold for messages of rclpy and for those that ``rosbags``
+deserialises without ROS, so one function reads both. To *make* a message one needs its
+class: :class:`Messages` carries the classes of one world, and how that world wants its arrays.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.calibration_set import CalibrationSet
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
+from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
+from omsm_ros.errors import BagError, CalibrationError, DataError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.calibration_file import calibration_of
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.quantities import TEMPERATURE
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# A set of the most members, each with a certificate of its own, is a megabyte.
+MAX_JSON_CHARACTERS = 2_000_000
+_SET = "calibration_set"
+
+_AXES = ("x", "y", "z", "b", "c")
+_POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
+# Of each field of a point: name, offset [bytes], type, count.
+_POINT_LAYOUT = [
+    (name, (POINT_DTYPE.fields or {})[name][1], _POINT_FIELD_TYPES[kind], 1)
+    for name, kind in CLOUD_FIELDS
+]
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Message classes by their short name ("AxisBlock", "Header", …) and an array maker."""
+
+    classes: Mapping[str, Callable[..., Any]]
+    sequence: Callable[[ArrayLike, DTypeLike], Any]
+
+    def make(self, name: str, /, **fields: object) -> Any:
+        """Return a new message ``name`` with all ``fields``."""
+        return self.classes[name](**fields)
+
+
+def ros_messages() -> Messages:
+    """Return the message classes of the sourced ROS workspace."""
+    from builtin_interfaces.msg import Time
+    from omsm_msgs import msg
+    from sensor_msgs.msg import PointCloud2, PointField
+    from std_msgs.msg import Header
+
+    names = ("AxisBlock", "DistanceBlock", "AccelerationBlock", "Calibration")
+    ours = {name: getattr(msg, name) for name in names}
+    others = {c.__name__: c for c in (Time, Header, PointCloud2, PointField)}
+    return Messages({**ours, **others}, _ros_sequence)
+
+
+def _ros_sequence(values: ArrayLike, dtype: DTypeLike) -> array.array[Any]:
+    contiguous = np.ascontiguousarray(values, dtype)
+    result: array.array[Any] = array.array(contiguous.dtype.char)
+    # Filling from the buffer is thousands of times faster than from an iterable.
+    result.frombytes(contiguous.view(np.uint8).data)
+    return result
+
+
+def stamp_of(message: Any) -> int:
+    """Return the header stamp of a message [ns]."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NANOSECONDS_PER_S + int(stamp.nanosec)
+
+
+def _block_fields(message: Any) -> dict[str, Any]:
+    return {
+        "stamp_ns": stamp_of(message),
+        "first_sample": int(message.first_sample),
+        "sample_period": float(message.sample_period),
+    }
+
+
+def axis_block(message: Any) -> AxisBlock:
+    """Return the record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
+    channels = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
+    return AxisBlock(**_block_fields(message), **channels)
+
+
+def distance_block(message: Any) -> DistanceBlock:
+    """Return the record of an ``omsm_msgs/DistanceBlock``; DataError if its channels do not fit."""
+    return DistanceBlock(
+        **_block_fields(message),
+        distance=np.asarray(message.distance, np.float64),
+        intensity=np.asarray(message.intensity, np.float32),
+        status=np.asarray(message.status, np.uint8),
+    )
+
+
+def acceleration_block(message: Any) -> AccelerationBlock:
+    """Return the record of an ``omsm_msgs/AccelerationBlock``; DataError if channels do not fit."""
+    channels = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
+    return AccelerationBlock(**_block_fields(message), **channels)
+
+
+def calibration(message: Any) -> Calibration:
+    """Return the record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
+
+    The certificate of a set carries the whole set; the other fields are then its middle member's.
+    """
+    certificate = _json_object("certificate", message.certificate)
+    if isinstance(content := certificate.get(_SET), dict):
+        return calibration_of({**content, "id": message.id}, "calibration message")
+    record = Calibration.from_content(
+        {
+            "numerator": message.numerator,
+            "denominator": message.denominator,
+            "delay": message.delay,
+            "static_gain": message.static_gain,
+            "sample_period": message.sample_period,
+            "valid_up_to": message.valid_up_to,
+            "covariance": message.covariance,
+            "settings": _json_object("settings", message.settings),
+            "certificate": certificate,
+        }
+    )
+    if message.id != record.id:
+        raise CalibrationError(
+            f"calibration message carries id {message.id!r} but its content hashes to "
+            f"{record.id!r}: it was altered on the way; identify or load it again"
+        )
+    return record
+
+
+def probe_settings(message: Any) -> dict[str, object]:
+    """Return what a probe's driver reported, a JSON object in a ``std_msgs/String``."""
+    return _json_object("probe_settings", message.data)
+
+
+def temperature(message: Any) -> float:
+    """Return a reading of a ``sensor_msgs/Temperature`` [°C], NaN for one that cannot be."""
+    return float(TEMPERATURE.or_lost(np.array([message.temperature]))[0])
+
+
+def _json_object(name: str, text: str) -> dict[str, object]:
+    if len(text) > MAX_JSON_CHARACTERS:
+        raise CalibrationError(
+            f"{name} of {len(text)} characters, at most {MAX_JSON_CHARACTERS} are accepted; "
+            "shorten it"
+        )
+    return json_and_yaml.object_of(text or "{}", CalibrationError, name)
+
+
+def cloud_array(message: Any) -> NDArray[np.void]:
+    """Return the points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``.
+
+    Raises DataError for a cloud of another layout.
+    """
+    if message.point_step != POINT_DTYPE.itemsize or message.is_bigendian:
+        raise DataError(
+            f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}; give "
+            "one that the corrector published"
+        )
+    layout = [(field.name, field.offset, field.datatype, field.count) for field in message.fields]
+    if layout != _POINT_LAYOUT:
+        names = ", ".join(name for name, *_ in _POINT_LAYOUT)
+        raise DataError(
+            f"cloud of {len(layout)} fields, expected {names}, each in its place and of its type; "
+            "give one that the corrector published"
+        )
+    size = message.width * message.height * message.point_step
+    if len(message.data) != size:
+        raise DataError(
+            f"cloud of {message.width} by {message.height} points with {len(message.data)} bytes, "
+            f"expected {size}; give one that the corrector published"
+        )
+    return np.frombuffer(memoryview(message.data), POINT_DTYPE)
+
+
+def header(messages: Messages, stamp_ns: int, frame: str) -> Any:
+    """Return a std_msgs/Header."""
+    sec, nanosec = divmod(stamp_ns, NANOSECONDS_PER_S)
+    return messages.make(
+        "Header", stamp=messages.make("Time", sec=sec, nanosec=nanosec), frame_id=frame
+    )
+
+
+def _block_message(messages: Messages, block: Block, frame: str) -> dict[str, Any]:
+    return {
+        "header": header(messages, block.stamp_ns, frame),
+        "first_sample": block.first_sample,
+        "sample_period": block.sample_period,
+    }
+
+
+def axis_message(messages: Messages, block: AxisBlock, frame: str = "machine") -> Any:
+    """Return ``omsm_msgs/AxisBlock`` of a record."""
+    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in _AXES}
+    return messages.make("AxisBlock", **_block_message(messages, block, frame), **channels)
+
+
+def distance_message(messages: Messages, block: DistanceBlock, frame: str = "probe") -> Any:
+    """Return ``omsm_msgs/DistanceBlock`` of a record."""
+    return messages.make(
+        "DistanceBlock",
+        **_block_message(messages, block, frame),
+        distance=messages.sequence(block.distance, np.float64),
+        intensity=messages.sequence(block.intensity, np.float32),
+        status=messages.sequence(block.status, np.uint8),
+    )
+
+
+def acceleration_message(messages: Messages, block: AccelerationBlock, frame: str = "probe") -> Any:
+    """Return ``omsm_msgs/AccelerationBlock`` of a record."""
+    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in "xyz"}
+    return messages.make("AccelerationBlock", **_block_message(messages, block, frame), **channels)
+
+
+def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
+    """Return ``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
+    certificate = dict(record.certificate)
+    if isinstance(record, CalibrationSet):
+        certificate[_SET] = record.content()
+    return messages.make(
+        "Calibration",
+        header=header(messages, stamp_ns, "machine"),
+        id=record.id,
+        numerator=messages.sequence(record.dynamics.numerator, np.float64),
+        denominator=messages.sequence(record.dynamics.denominator, np.float64),
+        delay=record.dynamics.delay,
+        static_gain=record.static_gain,
+        sample_period=record.sample_period,
+        valid_up_to=record.valid_up_to,
+        covariance=messages.sequence(record.covariance.ravel(), np.float64),
+        settings=json.dumps(dict(record.settings), sort_keys=True),
+        certificate=json.dumps(certificate, sort_keys=True),
+    )
+
+
+def _all_finite(packed: NDArray[np.void]) -> bool:
+    # A device that reports no intensity leaves NaN there, and PCL must know.
+    return all(bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind)
+
+
+def cloud_message(
+    messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
+) -> Any:
+    """Return ``sensor_msgs/PointCloud2`` of packed points (n,) of ``POINT_DTYPE``."""
+    fields = [
+        messages.make("PointField", name=name, offset=offset, datatype=datatype, count=count)
+        for name, offset, datatype, count in _POINT_LAYOUT
+    ]
+    return messages.make(
+        "PointCloud2",
+        header=header(messages, stamp_ns, frame),
+        height=1,
+        width=len(packed),
+        fields=fields,
+        is_bigendian=False,
+        point_step=POINT_DTYPE.itemsize,
+        row_step=POINT_DTYPE.itemsize * len(packed),
+        data=messages.sequence(packed.view(np.uint8), np.uint8),
+        is_dense=_all_finite(packed),
+    )
+
+
+# Levels of vibration in a message: a JSON object in a ``std_msgs/String``.
+
+MAX_CHARACTERS = 100_000
+_MOST_BANDS = 100
+_LEVEL: Mapping[str, Any] = {"type": "number", "minimum": 0}
+_LEVELS: Mapping[str, Any] = {"type": "array", "items": _LEVEL, "maxItems": _MOST_BANDS}
+_BAND: Mapping[str, Any] = {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}
+_SHAPE = {
+    "bands": {"type": "array", "items": _BAND, "minItems": 1, "maxItems": _MOST_BANDS},
+    "rms": form(dict.fromkeys("xyz", _LEVELS), tuple("xyz")),
+    "line": form(
+        {"axis": {"enum": list("xyz")}, "frequency": _LEVEL, "amplitude": _LEVEL},
+        ("axis", "frequency", "amplitude"),
+    ),
+    "height": {"anyOf": [_LEVELS, {"type": "null"}]},
+    "height_total": {"anyOf": [_LEVEL, {"type": "null"}]},
+    "windows": {"type": "integer", "minimum": 1},
+    "alarm": {"type": "boolean"},
+    "limit": _LEVEL,
+}
+_LINE_OF_HEIGHT = form(
+    dict.fromkeys(("frequency", "amplitude"), _LEVEL), ("frequency", "amplitude")
+)
+# Older recordings do not say what moves the height most.
+_SCHEMA = form({**_SHAPE, "height_line": _LINE_OF_HEIGHT}, tuple(_SHAPE))
+
+
+def vibration_levels(message: Any) -> dict[str, Any]:
+    """Return what the vibration monitor told, see ``VibrationLevels.entry``; alarm and limit, too.
+
+    BagError for a text that says something else.
+    """
+    text = message.data
+    if len(text) > MAX_CHARACTERS:
+        raise BagError(
+            f"vibration of {len(text)} characters, at most {MAX_CHARACTERS} are read; record the "
+            "topic of the vibration monitor"
+        )
+    found = json_and_yaml.object_of(text, BagError, "vibration")
+    check_form(found, _SCHEMA, BagError, "vibration")
+    lists = [*found["rms"].values(), *([found["height"]] if found["height"] is not None else [])]
+    lengths = {len(levels) for levels in lists}
+    if lengths != {len(found["bands"])}:
+        raise BagError(
+            f"vibration has {len(found['bands'])} bands and {sorted(lengths)} levels, expected one "
+            "of each; record the topic of the vibration monitor"
+        )
+    return found
+
+
+# The messages that bags are read and written with, where ROS is not installed.
+#
+# Ours come from the ``.msg`` texts that ROS builds from. The few of ROS itself are stated here as
+# Jazzy has them (std_msgs, sensor_msgs, builtin_interfaces): to load all that ROS 2 knows takes as
+# long as to correct a scan.
+
+_OF_ROS = {
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/msg/String": "string data\n",
+    "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "sensor_msgs/msg/Temperature": (
+        "std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n"
+    ),
+    "sensor_msgs/msg/PointField": (
+        "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\n"
+        "uint8 UINT32=6\nuint8 FLOAT32=7\nuint8 FLOAT64=8\n"
+        "string name\nuint32 offset\nuint8 datatype\nuint32 count\n"
+    ),
+    "sensor_msgs/msg/PointCloud2": (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
+        "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n"
+    ),
+}
+_MESSAGES = (
+    "omsm_msgs/msg/AxisBlock",
+    "omsm_msgs/msg/DistanceBlock",
+    "omsm_msgs/msg/AccelerationBlock",
+    "omsm_msgs/msg/Calibration",
+    *_OF_ROS,
+)
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """Return the types of omsm_msgs and those of ROS 2 Jazzy that they and our clouds hold."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    ours = {
+        f"omsm_msgs/msg/{p.stem}": p.read_text() for p in sorted(message_folder().glob("*.msg"))
+    }
+    for name, text in (_OF_ROS | ours).items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+def message_folder() -> Path:
+    """Return the folder of our ``.msg`` texts."""
+    package = Path(__file__).resolve().parents[1]
+    # Installed beside the code, or in a source checkout next to the package.
+    installed = package / "interfaces" / "msg"
+    return installed if installed.is_dir() else package.parent / "msg_defs" / "msg"
+
+
+@lru_cache(maxsize=1)
+def bag_messages() -> Messages:
+    """Return message classes for writing bags without ROS."""
+    types = typestore().types
+    return Messages({name.split("/")[-1]: types[name] for name in _MESSAGES}, _bag_sequence)
+
+
+def _bag_sequence(values: ArrayLike, dtype: DTypeLike) -> Any:
+    return np.ascontiguousarray(values, dtype)

@@ -1,0 +1,377 @@
+"""``cloud.ply``: the corrected points, written as they come and read in portions."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints, pack_points
+from omsm_ros.core.correction.systematic import ScanFields
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular, said, save_bytes, whole_file
+from omsm_ros.io.folders import read_result
+from omsm_ros.io.json_and_yaml import (
+    CONFORMITY,
+    FIGURE,
+    KNOWN_OR_NOT,
+    TEXT,
+    TEXTS,
+    check_form,
+    each,
+    group,
+    or_none,
+    ranged,
+    rows,
+)
+from omsm_ros.quantities import COUNTER, POSITION, SAMPLE_PERIOD, SIGNAL, STAMP
+
+_PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
+_PLY_HEADER_BYTES = 512
+_PLY_DTYPE = np.dtype(list(CLOUD_FIELDS))
+
+
+class PlyWriter:
+    """Streams points into a binary ``cloud.ply`` of the contract's fields.
+
+    Memory does not depend on the number of points: the header is written last, into the
+    room kept for it. Leaving by an exception leaves no file.
+    """
+
+    def __init__(self, path: Path | str, comment: str = "") -> None:
+        self._file = whole_file(path)
+        # A line break in a comment would end it and forge header lines.
+        self._comment = " ".join(comment.split())[:200]
+        self.points = 0
+
+    def __enter__(self) -> PlyWriter:
+        self._stream = self._file.__enter__()
+        self._stream.write(self._header())
+        return self
+
+    def write(self, points: SurfacePoints) -> NDArray[np.void]:
+        """Append points, and return them as :meth:`CloudFile.read` would (n,)."""
+        packed = pack_points(points, _PLY_DTYPE)
+        self._stream.write(packed.data)
+        self.points += len(packed)
+        return packed
+
+    def _header(self) -> bytes:
+        lines = _header_lines(self.points)
+        lines.insert(2, f"comment {self._comment}".encode("ascii", "replace"))
+        text = b"\n".join(lines) + b"\n"
+        padding = _PLY_HEADER_BYTES - len(text) - len("comment \nend_header\n")
+        return text + b"comment " + b" " * padding + b"\nend_header\n"
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._stream.seek(0)
+            self._stream.write(self._header())
+        self._file.__exit__(kind, error, trace)
+
+
+def _header_lines(points: int) -> list[bytes]:
+    """Return what the header of every cloud of ours says, but for comments."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}"]
+    lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
+    return [line.encode("ascii") for line in lines]
+
+
+class CloudFile:
+    """Our own ``cloud.ply``, read in portions: memory does not depend on its length.
+
+    points: how many it holds. Raises FileError if it is no cloud of ours, or was cut short.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
+        with self._opened() as stream:
+            head = stream.read(_PLY_HEADER_BYTES)
+            try:
+                held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
+            except OSError as err:  # what the kernel writes as it is read, as in /proc
+                raise FileError(f"{str(path)!r} has no length; give a file on a disk") from err
+        self.points = max(held, 0) // _PLY_DTYPE.itemsize
+        lines = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
+        if lines != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:
+            raise FileError(
+                f"{str(path)!r} is none of our clouds, or was cut short; correct the scan again"
+            )
+
+    def _opened(self) -> IO[bytes]:
+        return open_regular(self._path, FileError, "cloud")
+
+    def portions(self, size: int = 500_000) -> Iterator[NDArray[np.void]]:
+        """Yield all points in order, ``size`` at a time, as structured arrays of the contract.
+
+        Raises FileError for coordinates that are no numbers, or further off than any machine goes.
+        """
+        with self._opened() as stream:
+            stream.seek(_PLY_HEADER_BYTES)
+            while raw := stream.read(size * _PLY_DTYPE.itemsize):
+                rows = np.frombuffer(raw, _PLY_DTYPE)
+                for name in ("x", "y", "height"):
+                    what = f"cloud {str(self._path)!r}: {name}"
+                    POSITION.checked_all(rows[name], FileError, what)
+                yield rows
+
+    def read(self, most: int | None = None) -> NDArray[np.void]:
+        """Return all points, or evenly every k-th so that there are no more than ``most``."""
+        every = 1 if most is None else max(-(-self.points // most), 1)
+        parts = [part[::every].copy() for part in self.portions(every * 100_000)]
+        return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])
+
+
+def widened(
+    path: Path, variance: Callable[[int, int], FloatArray], size: int = 500_000
+) -> Iterator[NDArray[np.void]]:
+    """Add a variance to the uncertainty of each point of our cloud; yield the points as they are.
+
+    variance: [m²] of so many points from the one with that number on, (n,)
+    """
+    first = 0
+    with path.open("r+b") as stream:
+        for before in CloudFile(path).portions(size):
+            rows = before.copy()
+            spread = before["uncertainty"].astype(np.float64)
+            rows["uncertainty"] = np.sqrt(spread**2 + variance(first, len(rows)))
+            stream.seek(_PLY_HEADER_BYTES + first * _PLY_DTYPE.itemsize)
+            stream.write(rows.tobytes())
+            first += len(rows)
+            yield rows
+
+
+# ``summary.json`` of a measurement, read again: its kinds, where a page or a table uses them.
+
+_ANY = {"type": "object"}
+_COUNT, _NUMBER = ranged(COUNTER), ranged(SIGNAL)
+_ERROR = group({"rms": KNOWN_OR_NOT, "peak_to_valley": KNOWN_OR_NOT})
+_DEVIATION = group({"peak_to_valley": KNOWN_OR_NOT, "rms_area_weighted": KNOWN_OR_NOT})
+_STREAM = group(
+    {
+        "received": _COUNT,
+        "corrected": _COUNT,
+        "counted": each(_COUNT),
+    },
+    pending=_COUNT,
+)
+_SOURCE = {
+    "source": TEXT, "says": TEXT, "kind": TEXT, "status": TEXT, "unit": TEXT,
+    "reason": TEXT, "standard_uncertainty": KNOWN_OR_NOT, "height": KNOWN_OR_NOT,
+}  # fmt: skip
+_LIMIT = {
+    "name": TEXT, "unit": TEXT, "value": KNOWN_OR_NOT, "allowed": KNOWN_OR_NOT,
+    "speed_factor": _NUMBER,
+}  # fmt: skip
+_LIGHT = {
+    "level": {"enum": ["green", "amber", "red"]},
+    "word": TEXT,
+    "reasons": rows({"what": TEXT, "remedy": TEXT}),
+}
+_FORM = group(
+    {},
+    bag=TEXT,
+    calibration=TEXT,
+    sample_period=ranged(SAMPLE_PERIOD),
+    samples=each(_STREAM),
+    warnings=TEXTS,
+    settings=_ANY,
+    versions=_ANY,
+    files=_ANY,
+    admission=or_none(_ANY),
+    conditions=group(
+        {},
+        recorded_ns=or_none(ranged(STAMP)),
+        calibration_age=KNOWN_OR_NOT,
+        temperature=or_none(_ANY),
+    ),
+    prediction=or_none(
+        group(
+            {},
+            limits=rows(_LIMIT),
+            not_evaluated=TEXTS,
+            speed_factor=KNOWN_OR_NOT,
+        )
+    ),
+    dynamic_error_before=or_none(_ERROR),
+    dynamic_error_after=or_none(_ERROR),
+    deviation=or_none(group({}, raw=or_none(_DEVIATION), corrected=or_none(_DEVIATION))),
+    uncertainty=group({}, median=KNOWN_OR_NOT, largest=KNOWN_OR_NOT),
+    budget=or_none(group({}, sources=rows(_SOURCE))),
+    light=or_none(group(_LIGHT)),
+    form=or_none(
+        group(
+            {},
+            deviation=each(FIGURE),
+            conformity=or_none(group(CONFORMITY)),
+        )
+    ),
+)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Return the content of ``summary.json``: lengths [m], times [s], stamps [ns].
+
+    FileError where it is not there, too large, no JSON, or where something that is read from it
+    is of another kind than ``omsm correct`` writes.
+    """
+    summary = read_result(path, "summary")
+    check_form(summary, _FORM, FileError, f"summary {str(path)!r}")
+    return summary
+
+
+# ``form.json`` and ``curves.json`` of a registered part, read again: what a page uses of them.
+
+_NUMBER_FORM_FILE = ranged(SIGNAL)
+_SQUARE = {"type": "number", "minimum": 0, "maximum": SIGNAL.high}
+_ARRAY = {"type": "array"}
+_AGAIN = "register the part again"
+
+_REMOVED = group(
+    {},
+    fitted=TEXTS,
+    notes=TEXTS,
+    not_evaluated=TEXTS,
+    held=each(TEXT),
+    not_determined=each(TEXT),
+    pose_uncertainty=each(each(_NUMBER_FORM_FILE)),
+)
+_TERM = {"n": {"type": "integer"}, "m": {"type": "integer"}, **FIGURE["properties"]}
+_FORM_FORM_FILE = group(
+    {"zernike": rows(_TERM)},
+    deviation=each(FIGURE),
+    pose=each(FIGURE),
+    removed=_REMOVED,
+    conformity=or_none(group(CONFORMITY)),
+)
+_COLUMNS = ("position", "value", "uncertainty")
+_CURVE = group(dict.fromkeys(_COLUMNS, _ARRAY))
+_DENSITY = group(
+    {
+        "radial": _CURVE,
+        "azimuthal": _CURVE,
+        "mean_square": _SQUARE,
+        "mean_square_in_band": _SQUARE,
+        "band": {"type": "array", "items": _NUMBER_FORM_FILE, "minItems": 2, "maxItems": 2},
+    },
+    areal=group(dict.fromkeys(("x", "y", "value"), _ARRAY)),
+)
+_CURVES = group({}, profiles=each(_CURVE), psd=or_none(_DENSITY))
+
+
+def read_form(path: Path) -> dict[str, Any]:
+    """Return the content of ``form.json``: lengths [m], angles [rad].
+
+    FileError where it is not there, too large, no JSON, or where something that is read from it
+    is of another kind than a registration writes.
+    """
+    form, what = read_result(path, "form"), f"form {str(path)!r}"
+    check_form(form, _FORM_FORM_FILE, FileError, what)
+    removed = form.get("removed", {})
+    for source, shares in removed.get("pose_uncertainty", {}).items():
+        for name in removed.get("fitted", ()):
+            if name not in shares:
+                raise FileError(
+                    f"{what}: pose_uncertainty.{source} lacks {name}, which was fitted; {_AGAIN}"
+                )
+    return form
+
+
+def read_curves(path: Path) -> dict[str, Any]:
+    """Return the content of ``curves.json``: profiles [m], densities [m⁴].
+
+    FileError as :func:`read_form`, and for columns of a curve that do not fit each other.
+    """
+    curves, what = read_result(path, "curves"), f"curves {str(path)!r}"
+    check_form(curves, _CURVES, FileError, what)
+    density = curves.get("psd") or {}
+    parts = {n: density[n] for n in ("radial", "azimuthal") if n in density}
+    for name, curve in (curves.get("profiles", {}) | parts).items():
+        lengths = {len(_numbers(curve[column], f"{what}: {name}", 1)) for column in _COLUMNS}
+        if len(lengths) > 1:
+            raise FileError(f"{what}: {name} has columns of {sorted(lengths)} values; {_AGAIN}")
+    if areal := density.get("areal"):
+        x, y = (_numbers(areal[axis], f"{what}: areal.{axis}", 1) for axis in "xy")
+        shape = _numbers(areal["value"], f"{what}: areal.value", 2).shape
+        if shape != (len(y), len(x)):
+            raise FileError(
+                f"{what}: areal.value has {shape[0]} × {shape[1]} values at {len(y)} × {len(x)} "
+                f"frequencies; {_AGAIN}"
+            )
+    return curves
+
+
+def _numbers(values: object, what: str, axes: int) -> FloatArray:
+    try:
+        found = np.array(values, np.float64)
+    except (TypeError, ValueError) as err:
+        raise FileError(f"{what} is no row of numbers: {said(err)}; {_AGAIN}") from err
+    if found.ndim != axes or not found.size or not np.all(np.isfinite(found)):
+        raise FileError(f"{what} has shape {found.shape!r} or what is no number; {_AGAIN}")
+    return found
+
+
+# ``systematic.npz``: what the systematic errors of a scan do to its points.
+
+# A hundred fields of ten thousand points are four megabytes.
+MAX_BYTES = 100_000_000
+_NAMES = ("names", "fields", "every")
+
+
+def save_fields(path: Path | str, fields: ScanFields) -> None:
+    """Write ``systematic.npz``."""
+    content = io.BytesIO()
+    np.savez(
+        content,
+        names=np.array(fields.names, dtype=np.str_),
+        fields=fields.fields.astype(np.float32),
+        every=np.int64(fields.every),
+        bounds=np.array(fields.bounds, dtype=np.str_),
+        aligned=np.array(fields.aligned, dtype=np.str_),
+    )
+    save_bytes(path, content.getvalue())
+
+
+def load_fields(path: Path | str) -> ScanFields:
+    """Read ``systematic.npz``; FileError if it is something else."""
+    what = f"fields {str(path)!r}"
+    with open_regular(Path(path), FileError, "fields") as stream:
+        raw = stream.read(MAX_BYTES + 1)
+    if len(raw) > MAX_BYTES:
+        raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
+    try:
+        # No pickles, by default; a NaN that signals is refused below.
+        with np.load(io.BytesIO(raw)) as content, np.errstate(invalid="ignore"):
+            names, fields, every = (np.asarray(content[name]) for name in _NAMES)
+            # Where nobody says which are upper bounds, each may be one.
+            bounds = content["bounds"] if "bounds" in content else np.unique(names)
+            aligned = content.get("aligned", ())
+            if np.iscomplexobj(fields) or every.ndim:
+                raise ValueError("a field is complex, or its spacing is no single number")
+            values = fields.astype(np.float64)
+        found = ScanFields(
+            tuple(map(str, names)),
+            values,
+            int(every),
+            tuple(map(str, bounds)),
+            tuple(map(str, aligned)),
+        )
+    except Exception as err:  # whatever numpy says of a damaged archive
+        raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err
+    shape = found.fields.shape
+    if len(shape) != 2 or shape[0] != len(names) or found.every < 1:
+        raise FileError(f"{what} have shape {shape!r} for {len(names)} names; correct it again")
+    if not np.all(np.isfinite(found.fields)):
+        raise FileError(f"{what} hold what is no number; correct the scan again")
+    return found

@@ -1,0 +1,356 @@
+"""Tables in files of arrays: NumPy, MATLAB, HDF5.
+
+A column of a table is named ``dataset[3]``, counted from 0; a plain array's columns are ``[0]``,
+``[1]`` and so on. What lies in a group, a MATLAB structure or a structured array is ``group/name``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import io
+import logging
+import os
+import re
+import resource
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular, said
+from omsm_ros.io.optional_libraries import walked
+from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# Does a library live through a file? Some trust it so far that a damaged one ends the process.
+
+
+def survives(read: Callable[[], object]) -> bool:
+    """Return whether a process that calls ``read`` lives on; what it raises is no matter.
+
+    It is a copy of this one, so that nothing is loaded anew, as a process of its own would for a
+    second, and is gone with all that it read.
+    """
+    with warnings.catch_warnings():
+        # Python 3.12 warns where there are threads; the copy waits for none of them.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        faulthandler.disable()  # one line is told by who asked
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with contextlib.suppress(BaseException):
+            read()
+        os._exit(0)
+    return not os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+
+# What is loaded whole: archives of NumPy, MATLAB's own files.
+_MAX_WHOLE_BYTES = 4_000_000_000
+# No recording is packed a hundred times; an archive that is, and is large, was made to fill memory.
+_MAX_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 100_000_000
+_MAX_COLUMNS = 1000
+
+_MATLAB_PACKED = 15  # miCOMPRESSED of "MAT-File Format"
+_INDEXED = re.compile(r"(.*)\[(\d{1,4})\]")
+
+
+class ArrayTable(ForeignTable):
+    """The arrays of one file, of one dimension or two."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        read = {
+            ".npy": self._numpy, ".npz": self._numpy, ".mat": self._matlab,
+            ".h5": self._hdf5, ".hdf5": self._hdf5,
+        }[path.suffix.lower()]  # fmt: skip
+        with open_regular(path, FileError, "table") as stream:
+            size = stream.seek(0, io.SEEK_END)
+        if size > _MAX_WHOLE_BYTES and read != self._hdf5:
+            raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
+        try:
+            self._arrays = dict(_flat("", read()))
+        except FileError:
+            raise
+        except Exception as err:  # whatever a library says of a damaged file
+            raise FileError(
+                f"{self} cannot be read: {said(err)}; write it again, or as CSV"
+            ) from err
+        for name, array in self._arrays.items():
+            self._name(name, array)
+
+    def _name(self, name: str, array: Any) -> None:
+        if array.dtype.kind not in "fiu":
+            return
+        if array.ndim == 1:
+            self.names.append(name)
+        elif array.ndim == 2:
+            columns = range(min(array.shape[1], _MAX_COLUMNS))
+            self.names += [f"{name}[{column}]" for column in columns]
+
+    def _numpy(self) -> Mapping[str, Any]:
+        with open_regular(self.path, FileError, "table") as stream:
+            if zipfile.is_zipfile(stream):
+                with zipfile.ZipFile(stream) as archive:
+                    self._check_unpacked(sum(member.file_size for member in archive.infolist()))
+            stream.seek(0)
+            alone = stream.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX
+            stream.seek(0)
+            # Pickles are refused, by default.
+            if alone:
+                return {"": np.load(self.path, mmap_mode="r")}
+            loaded = np.load(stream)
+            return {name: loaded[name] for name in loaded.files}
+
+    def _matlab(self) -> Mapping[str, Any]:
+        from scipy.io import loadmat
+
+        with open_regular(self.path, FileError, "table") as stream:
+            head = stream.read(10)
+            if head == b"MATLAB 7.3":  # which is HDF5 under another name
+                return self._hdf5()
+            if head == b"MATLAB 5.0":
+                self._check_unpacked(_unpacked_matlab(stream))
+
+        def load() -> Mapping[str, Any]:
+            with warnings.catch_warnings():  # complex numbers would lose a part without a word
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                warnings.simplefilter("error", UserWarning)  # and orders of bytes be guessed
+                loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
+            return loaded
+
+        if not survives(load):
+            raise FileError(
+                f"{self} cannot be read: what it holds does not fit together; write it again, or "
+                "as CSV"
+            )
+        return load()
+
+    def _check_unpacked(self, size: int) -> None:
+        """Raise FileError for an archive that holds far more bytes than any recording would."""
+        packed = self.path.stat().st_size
+        if size > max(_MAX_PACKED * packed, _ALWAYS_UNPACKED_BYTES):
+            raise FileError(
+                f"{self} has {packed} bytes and would unpack to {size}; check that it is a "
+                "recording, and leave out what is none"
+            )
+
+    def _hdf5(self) -> Mapping[str, Any]:
+        try:
+            import h5py
+        except ImportError as err:
+            raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
+        walked(self.path, str(self))
+        found: dict[str, Any] = {}
+        file = self._opened.enter_context(h5py.File(self.path, "r"))
+
+        def keep(name: str, item: object) -> None:
+            if isinstance(item, h5py.Dataset):
+                # MATLAB writes a column of numbers as a table of one row.
+                row = item.ndim == 2 and item.shape[0] == 1
+                if row and item.dtype.names is not None and item.nbytes < _ALWAYS_UNPACKED_BYTES:
+                    found[name] = item[0]
+                else:
+                    found[name] = _Row(item) if row else item
+                stated = item.attrs.get("units", item.attrs.get("unit"))
+                if isinstance(stated, str):
+                    self.units[name] = stated
+
+        file.visititems(keep)
+        return found
+
+    def _pieces(
+        self, names: Sequence[str], dates: frozenset[str]
+    ) -> Iterator[dict[str, FloatArray]]:
+        if dates:
+            raise FileError(
+                f"{self} has numbers, no dates, in {sorted(dates)}; give them another unit"
+            )
+        views = {name: self._view(name) for name in names}
+        lengths = {name: len(array) for name, (array, _) in views.items()}
+        if len(set(lengths.values())) > 1:
+            raise FileError(f"{self} has columns of different lengths {lengths}; cut them alike")
+        for low in range(0, lengths[names[0]], PIECE_ROWS):
+            rows = slice(low, low + PIECE_ROWS)
+            yield {
+                name: np.asarray(array[rows] if column is None else array[rows, column], np.float64)
+                for name, (array, column) in views.items()
+            }
+
+    def _view(self, name: str) -> tuple[Any, int | None]:
+        if name in self._arrays:
+            return self._arrays[name], None
+        indexed = _INDEXED.fullmatch(name)
+        assert indexed is not None  # it is one of self.names
+        return self._arrays[indexed[1]], int(indexed[2])
+
+
+class _Row:
+    """A data set of one row (1, n) as a column (n,), read piece by piece."""
+
+    ndim = 1
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset, self.dtype = dataset, dataset.dtype
+
+    def __len__(self) -> int:
+        return int(self._dataset.shape[1])
+
+    def __getitem__(self, rows: slice) -> Any:
+        return self._dataset[0, rows]
+
+
+def _unpacked_matlab(stream: IO[bytes]) -> int:
+    """Return how many bytes the variables of a MATLAB 5 file say that they have when unpacked."""
+    stream.seek(126)
+    order = "<" if stream.read(2) == b"IM" else ">"
+    total = 0
+    while len(head := stream.read(8)) == 8:
+        kind, size = struct.unpack(f"{order}II", head)
+        after = stream.tell() + size
+        if kind == _MATLAB_PACKED:
+            inside = zlib.decompressobj().decompress(stream.read(min(size, 1000)), 8)
+            size = struct.unpack(f"{order}II", inside)[1]
+        total += size
+        stream.seek(after)
+    return total
+
+
+def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:
+    """Yield every array in ``found`` with its name; those of a structure below the name of it."""
+    if isinstance(found, Mapping):
+        parts = list(found.items())
+    elif fields := getattr(getattr(found, "dtype", None), "names", None):
+        # A field of a data set in a file is a view, of an array in memory its part.
+        read = found.fields if hasattr(found, "fields") else found.__getitem__
+        parts = [(field, read(field)) for field in fields]
+    else:
+        if hasattr(found, "dtype"):
+            yield name, found
+        return
+    for part, value in parts:
+        yield from _flat(f"{name}/{part}" if name else part, value)
+
+
+# Channels of a TDMS file, the format of LabVIEW and DIAdem; named ``group/channel``.
+
+# Properties that LabVIEW gives a channel (ni.com, "TDMS File Format Internal Structure").
+_UNIT, _PERIOD = "unit_string", "wf_increment"
+_BEGINS = ("wf_start_time", "wf_start_offset")
+_SCALES, _MOST_SCALES = "NI_Number_Of_Scales", 100
+# Where the library warns that numbers are others than the file means, and goes on.
+_NOT_PASSED_OVER = ("nptdms.scaling", "nptdms.base_segment", "nptdms.tdms_segment")
+
+
+class _Refusal(logging.Handler):
+    """A warning is an error: of a scale that is not known, the raw numbers would be read."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        raise ValueError(record.getMessage())
+
+
+class TdmsTable(ForeignTable):
+    """The channels of one file; its units and its period are held against the map's."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        try:
+            from nptdms import TdmsFile
+            from nptdms.log import log_manager
+        except ImportError as err:
+            raise FileError(f"{self} needs npTDMS; pip install npTDMS, or give CSV") from err
+        log_manager.set_level(logging.CRITICAL)
+        for name in _NOT_PASSED_OVER:
+            logger = logging.getLogger(name)
+            logger.setLevel(logging.WARNING)
+            logger.handlers[:] = [_Refusal()]
+        with ExitStack() as opening:
+            stream = opening.enter_context(open_regular(path, FileError, "table"))
+            try:
+                self._take(opening.enter_context(TdmsFile.open(stream)))
+            except Exception as err:  # whatever the library says of a damaged file
+                raise self._damaged(err) from err
+            self._opened = opening.pop_all()
+
+    def _take(self, file: Any) -> None:
+        if file.file_status.incomplete_final_segment:
+            raise ValueError("it was cut short")
+        for group in file.groups():
+            for told in (file, group, *group.channels()):
+                _check_scales(told.properties)
+        self._channels = {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
+        self.names = [n for n, c in self._channels.items() if _kind(c) in "fiuM"]
+        properties = {name: self._channels[name].properties for name in self.names}
+        self.units = {n: str(p[_UNIT]) for n, p in properties.items() if p.get(_UNIT)}
+        self._properties = properties
+
+    def used(self, names: Sequence[str]) -> None:
+        """Take the period of the channels ``names``; FileError where they are not side by side."""
+        told = {name: self._properties[name] for name in names}
+        for key in (_PERIOD, *_BEGINS):
+            values = {p[key]: name for name, p in told.items() if p.get(key)}
+            if len(values) > 1:
+                one, other = list(values.items())[:2]
+                raise FileError(
+                    f"{self} states {key} {one[0]} of {one[1]!r} and {other[0]} of {other[1]!r}; "
+                    "their rows do not belong together: write them on one clock"
+                )
+            if key == _PERIOD and values:
+                (self.sample_period,) = (self._period(value) for value in values)
+
+    def _period(self, stated: object) -> float:
+        try:
+            return float(stated)  # type: ignore[arg-type]
+        except (TypeError, ValueError) as err:
+            raise self._damaged(err) from err
+
+    def _damaged(self, err: Exception) -> FileError:
+        return FileError(f"{self} cannot be read: {said(err)}; write it again, or as CSV")
+
+    def _pieces(
+        self, names: Sequence[str], dates: frozenset[str]
+    ) -> Iterator[dict[str, FloatArray]]:
+        lengths = {name: len(self._channels[name]) for name in names}
+        if len(set(lengths.values())) > 1:
+            raise FileError(f"{self} has channels of different lengths {lengths}; cut them alike")
+        for low in range(0, lengths[names[0]], PIECE_ROWS):
+            yield {name: self._slice(name, low, name in dates) for name in names}
+
+    def _slice(self, name: str, low: int, dated: bool) -> FloatArray:
+        try:
+            values: Any = self._channels[name][low : low + PIECE_ROWS]
+        except Exception as err:
+            raise self._damaged(err) from err
+        if dated != (values.dtype.kind == "M"):
+            holds = "numbers" if dated else "dates"
+            raise FileError(
+                f"{self} has {holds} in {name!r}; its unit in the map says otherwise: correct it"
+            )
+        if dated:  # always UTC
+            since = values.astype("datetime64[ns]").astype(np.int64)
+            return np.asarray(since / NANOSECONDS_PER_S)
+        with np.errstate(invalid="ignore"):  # damaged singles; what is no number is told
+            return np.asarray(values, np.float64)
+
+
+def _check_scales(properties: Mapping[str, object]) -> None:
+    """Raise ValueError for more scales than anybody chains: the library would make them all."""
+    scales = properties.get(_SCALES, 0)
+    if isinstance(scales, int | float | np.number) and not scales <= _MOST_SCALES:
+        raise ValueError(f"{_SCALES} is {scales}, expected at most {_MOST_SCALES}")
+
+
+def _kind(channel: Any) -> str:
+    """Return the kind of a channel's numbers; "f" where only reading it tells what is wrong."""
+    try:
+        return str(channel.dtype.kind)
+    except Exception:  # whatever the library says of a channel that nobody may want
+        return "f"

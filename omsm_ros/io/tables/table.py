@@ -1,0 +1,224 @@
+"""What every recording of another program is, once it is opened: named columns of numbers."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.imported_columns import CHANNELS, Column, ColumnMap
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import read_text
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.quantities import SIGNAL, shown
+from omsm_ros.units import COUNT, DATE, UNITS
+
+MAX_ROWS = 200_000_000
+PIECE_ROWS = 100_000
+
+
+_IN_NAME = re.compile(r".*[\[(]\s*([^\[\]()/\s]+)\s*[\])]?\s*")
+# Without brackets a word may be no unit: log/V is a channel, y_in an input.
+_AFTER_NAME = re.compile(r".*[_\s/]([^\[\]()/\s_]+)\s*")
+
+
+_SURE = frozenset[str]().union(*UNITS.values()) - {DATE, "1"}
+
+
+@dataclass(frozen=True, slots=True)
+class TableForm:
+    """What a map says of how a table is written.
+
+    delimiter: between columns of a text, " " = any run of blanks;  decimal: before the fraction
+    lines_before: before the line of names;  lines_after: between it and the first numbers
+    named: whether a text has a line of names; without one its columns are [0], [1], …
+    missing: texts that mean "no reading";  zone: of dates that state none, "Z" or "+01:00"
+    """
+
+    delimiter: str = ","
+    decimal: str = "."
+    lines_before: int = 0
+    lines_after: int = 0
+    named: bool = True
+    missing: tuple[str, ...] = ()
+    zone: str = ""
+
+
+class ForeignTable(ABC):
+    """Columns by name: ``names`` of all, ``units`` that the file itself states of some.
+
+    repeated_names: lines met so far that repeat the line of names, and hold no numbers
+    passed_over: messages met so far that hold none of the columns
+    sample_period: that the file itself states [s], None if it does not
+    units_in_names: whether names of columns may hold units
+    """
+
+    sample_period: float | None = None
+    units_in_names = True
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.names: list[str] = []
+        self.units: dict[str, str] = {}
+        self.repeated_names = self.passed_over = 0
+        self._opened = ExitStack()
+
+    def __str__(self) -> str:
+        return f"table {str(self.path)!r}"
+
+    @property
+    def label(self) -> str:
+        """Return what people call it."""
+        return str(self.path)
+
+    def pieces(self, names: Sequence[str], dates: Sequence[str]) -> Iterator[dict[str, FloatArray]]:
+        """Yield the columns ``names`` in pieces of rows, each (n,) in the units of the file.
+
+        dates: those of them that hold dates, given in seconds since 1970
+
+        Raises FileError for what is no number or date, naming the row.
+        """
+        rows = self.repeated_names = self.passed_over = 0
+        for piece in self._pieces(names, frozenset(dates)):
+            rows += len(piece[names[0]])
+            if rows > MAX_ROWS:
+                raise FileError(f"{self} has more than {MAX_ROWS} rows; split it")
+            yield piece
+
+    @abstractmethod
+    def _pieces(
+        self, names: Sequence[str], dates: frozenset[str]
+    ) -> Iterator[dict[str, FloatArray]]:
+        """Yield pieces of some rows."""
+
+    def used(self, names: Sequence[str]) -> None:  # noqa: B027
+        """Say that the columns ``names`` will be read; FileError where they do not fit together."""
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._opened.close()
+
+    def hint(self, names: Sequence[str]) -> str:
+        """Return what may help where columns ``names`` are not there; empty if nothing is seen."""
+        return ""
+
+
+def stated_unit(table: ForeignTable, name: str) -> str:
+    """Return the unit that a file states of a column, as in "Z [mm]" or z_mm too; empty if none."""
+    if name in table.units:
+        return table.units[name].strip()
+    if not table.units_in_names:
+        return ""
+    if found := _IN_NAME.fullmatch(name):
+        return found[1]
+    found = _AFTER_NAME.fullmatch(name)
+    return found[1] if found and found[1] in _SURE else ""
+
+
+# ``MAP.yaml``: which column of a foreign recording is which channel, in which unit.
+
+_MAX_BYTES = 100_000
+_BY_PLACE = re.compile(r"\[\d{1,4}\]")
+
+_TEXT = {"type": "string", "minLength": 1}
+_LINES = {"type": "integer", "minimum": 0, "maximum": 1000}
+_COLUMN = form(
+    {"name": _TEXT, "unit": _TEXT, COUNT: NUMBER, "sign": {"enum": [1, -1]}, "constant": NUMBER}, ()
+)
+_MAP = form(
+    {
+        "columns": form(dict.fromkeys(CHANNELS, _COLUMN), ()),
+        "sample_period": NUMBER,
+        "start": NUMBER,
+        "invalid": {"type": "array", "items": {"anyOf": [NUMBER, _TEXT]}, "maxItems": 100},
+        "delimiter": {"type": "string", "minLength": 1, "maxLength": 1},
+        "decimal": {"enum": [".", ","]},
+        "zone": {"type": "string", "pattern": r"^(Z|[+-](0\d|1[0-4]):[0-5]\d)$"},
+        "lines_before_names": _LINES,
+        "lines_after_names": _LINES,
+    },
+    ("columns",),
+)
+
+
+def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
+    """Read ``MAP.yaml``; FileError for anything that is unclear, a unit above all."""
+    what = f"map {str(path)!r}"
+    text = read_text(path, _MAX_BYTES, FileError, "map")
+    content = json_and_yaml.mapping_of(text, FileError, what)
+    check_form(content, _MAP, FileError, what)
+    invalid = content.get("invalid", ())
+    try:
+        mapped = ColumnMap(
+            {c: _column(c, given) for c, given in content["columns"].items()},
+            content.get("sample_period"),
+            float(content.get("start", 0.0)),
+            tuple(float(value) for value in invalid if not isinstance(value, str)),
+        )
+    except DataError as err:
+        raise FileError(f"{what}: {err}") from err
+    written = TableForm(
+        content.get("delimiter", ","),
+        content.get("decimal", "."),
+        content.get("lines_before_names", 0),
+        content.get("lines_after_names", 0),
+        _is_named(mapped),
+        tuple(text for text in invalid if isinstance(text, str)),
+        content.get("zone", ""),
+    )
+    if written.delimiter == written.decimal:
+        raise FileError(
+            f"{what}: {written.decimal!r} stands between columns and before the fraction; "
+            "write delimiter: ';' or what the file has"
+        )
+    return mapped, written
+
+
+def _is_named(mapped: ColumnMap) -> bool:
+    """Return whether columns have names; where all are [0], [1], … a text has no line of them."""
+    names = mapped.names(CHANNELS)
+    return not names or not all(_BY_PLACE.fullmatch(name) for name in names)
+
+
+def _column(channel: str, given: Mapping[str, Any]) -> Column:
+    if ("name" in given) == ("constant" in given):
+        raise DataError(f"{channel} needs a column's name, or a constant; give one of them")
+    sign = float(given.get("sign", 1))
+    if "constant" in given:
+        if channel in ("trigger", "time"):
+            raise DataError(
+                f"{channel} is constant, which tells no sample from another; name its column, or "
+                "leave it out"
+            )
+        constant = SIGNAL.checked(float(given["constant"]), DataError, f"{channel}: constant")
+        return Column("", constant=constant and constant * _factor(channel, given, sign))
+    return Column(given["name"], _factor(channel, given, sign), unit=given.get("unit", ""))
+
+
+def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
+    """Return the SI value of a column's unit. One that is not written is never guessed."""
+    units = UNITS[channel]
+    if channel == "trigger":
+        return 1.0
+    unit = given.get("unit")
+    if unit == COUNT:
+        if COUNT not in given:
+            raise DataError(
+                f"{channel}: what is one count in SI? write it into the map, as count: 1e-9"
+            )
+        value = float(given[COUNT])
+        if not 1e-15 <= abs(value) <= 1.0:
+            raise DataError(
+                f"{channel}: one count is {value:g} in SI, expected 1e-15 to 1 m or rad"
+            )
+        return value * sign
+    if unit not in units:
+        said = "has no unit" if unit is None else f"has the unit {shown(unit)}"
+        raise DataError(f"{channel} {said}; write one of {[*units, COUNT]}")
+    return units[unit] * sign

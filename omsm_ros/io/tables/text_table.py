@@ -1,0 +1,347 @@
+"""A table in text: CSV and its like, as loggers, controls and spreadsheets write them."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import open_regular
+from omsm_ros.io.tables.table import ForeignTable, TableForm
+from omsm_ros.quantities import shown
+from omsm_ros.units import NANOSECONDS_PER_S, WORDS
+
+# When is it that a text calls 2026-11-21T14:03:05.125+01:00?
+
+EXPECTED = "expected a date after ISO 8601, as 2026-11-21T14:03:05.125+01:00"
+
+_DATE = re.compile(
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)(?:[.,](\d{1,9}))?\s*"
+    r"(Z|[+-](?:0\d|1[0-4])(?::?[0-5]\d)?)?"
+)
+# What 64 bits of nanoseconds hold; a later one would be another date.
+_FIRST_DAY, _LAST_DAY = "1700-01-01", "2261-12-31"
+
+
+def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
+    """Return the instants (n,) that ``texts`` name, to a quarter of a microsecond.
+
+    zone: of those that state none; empty = they must
+
+    Raises ValueError, which names the remedy, for a text that is no such date, or has no zone.
+    """
+    days, shifts = [], []
+    for text in texts:
+        found = _DATE.fullmatch(text.strip().strip('"'))
+        if found is None:
+            raise ValueError(EXPECTED)
+        day, clock, fraction, stated = found.groups()
+        if not (stated or zone):
+            raise ValueError("the date has no time zone; write it into the map, as zone: '+01:00'")
+        if stated and zone:
+            raise ValueError("the date states its time zone; leave zone out of the map")
+        if not _FIRST_DAY <= day <= _LAST_DAY:
+            raise ValueError(f"expected a date from {_FIRST_DAY} to {_LAST_DAY}")
+        days.append(f"{day}T{clock}" + (f".{fraction}" if fraction else ""))
+        shifts.append(shift_of(stated or zone))
+    since = np.array(days, "datetime64[ns]").astype(np.int64)
+    return np.asarray(since / NANOSECONDS_PER_S - np.array(shifts))
+
+
+def shift_of(zone: str) -> float:
+    """Return how far a zone is ahead of UTC [s]: of "Z", "+01", "+01:00" or "+0100"."""
+    if zone == "Z":
+        return 0.0
+    hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
+    return (1.0 if zone[0] == "+" else -1.0) * (hours * 3600.0 + minutes * 60.0)
+
+
+# A hundred thousand rows of five columns or so.
+_PIECE_CHARACTERS = 4_000_000
+_MAX_LINE_CHARACTERS = 100_000
+_PROBED_BYTES = 65_536
+# Lines among which a misplaced line of names is looked for.
+_HEAD_LINES = 1000
+# At the end of each piece, so of the file: averages, totals, "end of log".
+_FOOT_LINES = 20
+_NO_TEXT = {
+    b"PK\x03\x04": "it is a workbook or an archive; save the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "it is a workbook; save the sheet as CSV",
+    b"TDSm": "it is TDMS; name it .tdms",
+    b"\x89HDF": "it is HDF5; name it .h5",
+    b"\x89MCA": "it is a ROS bag; name it .mcap",
+}
+_DELIMITERS = (";", "\t", ",", "|")
+# 1 234, 1'234 or 1,234.5, of which 1,234 alone may be a decimal comma; spaces may be narrow.
+_GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)?|.*,.*\\..*")
+
+
+class TextTable(ForeignTable):
+    """Lines of cells below a line of names; read piece by piece, whatever its length."""
+
+    def __init__(self, path: Path, form: TableForm) -> None:
+        super().__init__(path)
+        self._form = form
+        self._encoding = self._probed()
+        _, lines = next(self._lines(), (1, []))
+        self._top = lines[:_HEAD_LINES]
+        place = form.lines_before
+        while place < len(lines) and not lines[place].strip():
+            place += 1
+        if place >= len(lines):
+            kind = "line of names" if form.named else "row of numbers"
+            raise FileError(
+                f"{self} has no {kind} after {form.lines_before} lines; give its first line one"
+            )
+        head = self._named_cells(lines[place])
+        self._head = lines[place].strip() if form.named else None
+        self._first_row = place + 1 + form.lines_after if form.named else place
+        body = [line for line in lines[self._first_row :] if line.strip()]
+        self._first_cells = self._cells(body[0]) if body else []
+        self.names = head if form.named else [f"[{i}]" for i in range(len(head))]
+        for line in reversed(lines[place + 1 : self._first_row] if form.named else []):
+            self.units.update(self._stated_units(line))
+
+    def hint(self, names: Sequence[str]) -> str:
+        """Return where the line of names may be, or how its cells may be separated."""
+        for number, line in enumerate(self._top):
+            for mark in (self._form.delimiter, *_DELIMITERS):
+                if set(names) <= {cell.strip().strip('"') for cell in line.split(mark)}:
+                    if mark != self._form.delimiter:
+                        return f"line {number + 1} has them: write delimiter: {mark!r} into the map"
+                    return f"line {number + 1} has them: write lines_before_names: {number}"
+        if self._form.named and all(_is_number(name) for name in self.names):
+            return "its first line holds numbers: name its columns by place, from [0]"
+        return ""
+
+    def _probed(self) -> str:
+        """Return how the file is encoded; FileError for what is no text."""
+        with open_regular(self.path, FileError, "table") as stream:
+            start = stream.read(_PROBED_BYTES)
+        if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return "utf-16"
+        for mark, remedy in _NO_TEXT.items():
+            if start.startswith(mark):
+                raise FileError(f"{self} is no text: {remedy}")
+        if b"\0" in start:
+            raise FileError(f"{self} is no text: it holds zero bytes; save it as CSV in UTF-8")
+        try:
+            codecs.getincrementaldecoder("utf-8")().decode(start)
+        except UnicodeDecodeError:
+            return "cp1252"  # western Windows: its µ and ° are in names of columns
+        return "utf-8-sig"
+
+    def _lines(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield the pieces of lines, each with the number of its first, from 1."""
+        number, rest = 1, ""
+        raw = open_regular(self.path, FileError, "table")
+        with io.TextIOWrapper(raw, self._encoding, "replace", newline=None) as stream:
+            while text := stream.read(_PIECE_CHARACTERS):
+                lines = (rest + text).split("\n")
+                # The last line may have no end; it is no piece of its own.
+                rest = lines.pop() if len(text) == _PIECE_CHARACTERS or not lines[-1] else ""
+                if len(rest) > _MAX_LINE_CHARACTERS:
+                    raise FileError(
+                        f"{self}, line {number + len(lines)} has more than "
+                        f"{_MAX_LINE_CHARACTERS} characters; it is no table of numbers"
+                    )
+                yield number, lines
+                number += len(lines)
+            if rest:
+                yield number, [rest]
+
+    def _cells(self, line: str) -> list[str]:
+        mark = self._form.delimiter
+        return line.split() if mark == " " else line.split(mark)
+
+    def _named_cells(self, line: str) -> list[str]:
+        """Return the cells of the line of names, which alone may hold delimiters in quotes."""
+        if len(line) > _MAX_LINE_CHARACTERS:
+            raise FileError(
+                f"{self} has {len(line)} characters in a line; give a table of numbers, one row a "
+                "line"
+            )
+        cells = self._cells(line)
+        if '"' in line and self._form.delimiter != " ":
+            cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
+        return [cell.strip().strip('"') for cell in cells]
+
+    def _stated_units(self, line: str) -> dict[str, str]:
+        """Return the units that a line below the names holds, as mm, [mm] or (mm)."""
+        cells = [cell.strip().strip("[]()").strip() for cell in self._named_cells(line)]
+        return {n: unit for n, unit in zip(self.names, cells, strict=False) if unit in WORDS}
+
+    def _pieces(
+        self, names: Sequence[str], dates: frozenset[str]
+    ) -> Iterator[dict[str, FloatArray]]:
+        rows = _Rows(self, [self.names.index(n) for n in names], [n in dates for n in names])
+        for number, piece in self._lines():
+            skip = max(0, self._first_row - (number - 1))
+            lines = piece[skip:]
+            columns = self._numbers(lines, rows, number + skip)
+            self._check_foot(lines, number + skip)
+            if len(columns[0]):
+                yield dict(zip(names, columns, strict=True))
+
+    def _numbers(self, lines: list[str], rows: _Rows, number: int) -> list[FloatArray]:
+        lines_with = [(number + i, line) for i, line in enumerate(lines) if line.strip()]
+        kept = [line for _, line in lines_with]
+        try:
+            return rows.read(kept)
+        except ValueError:
+            # Joined logs repeat their line of names: no numbers are lost with it.
+            lines_with = [pair for pair in lines_with if pair[1].strip() != self._head]
+            self.repeated_names += len(kept) - len(lines_with)
+            try:
+                return rows.read([line for _, line in lines_with])
+            except ValueError:
+                raise self._culprit(lines_with, rows) from None
+
+    def _check_foot(self, lines: list[str], first_number: int) -> None:
+        """Raise FileError for a line below the table, such as "mean;4.5", that is no sample."""
+        known = {"", *(text.lower() for text in self._form.missing)}
+        low = max(0, len(lines) - _FOOT_LINES)
+        for number, line in enumerate(lines[low:], first_number + low):
+            if line.strip() == self._head:
+                continue
+            for first, cell in zip(self._first_cells, self._cells(line), strict=False):
+                if _is_number(first) and not _is_number(cell) and cell.strip().lower() not in known:
+                    raise FileError(
+                        f"{self}, line {number}: {shown(line.strip())} has {shown(cell.strip())} "
+                        "where the first row has a number; if it is no row of the table, delete it"
+                    )
+
+    def _culprit(self, lines: list[tuple[int, str]], rows: _Rows) -> FileError:
+        """Return the first line that is no row of numbers, and what may be wrong with it."""
+        good, bad = 0, len(lines)  # lines[:good] are rows, lines[:bad] are not all
+        while bad - good > 1:
+            middle = (good + bad) // 2
+            try:
+                rows.read([line for _, line in lines[good:middle]])
+                good = middle
+            except ValueError:
+                bad = middle
+        number, line = lines[good]
+        return FileError(
+            f"{self}, line {number}: {shown(line.strip())} is no row; "
+            f"{self._remedy(number, line, rows)}"
+        )
+
+    def _remedy(self, number: int, line: str, rows: _Rows) -> str:
+        cells = self._cells(line)
+        of_units = number == self._first_row + 1 and not any(map(_is_number, cells))
+        if of_units and self._form.named and len(cells) == len(self.names):
+            return "if it is a line of units, write lines_after_names: 1 into the map"
+        if any(_GROUPED.fullmatch(cell.strip().strip('"')) for cell in cells):
+            return "write numbers without marks between thousands"
+        if self._form.decimal == "." and self._form.delimiter != "," and "," in line:
+            return "for decimal commas, write decimal: ',' into the map"
+        if self._form.decimal == "." and ";" in line and "," in line:
+            return "for decimal commas, write decimal: ',' and delimiter: ';' into the map"
+        if len(cells) != len(self.names):
+            of_commas = ", or its comma is a decimal one" if self._form.delimiter == "," else ""
+            return (
+                f"it has {len(cells)} cells under {len(self.names)} names; "
+                f"check whether it was cut{of_commas}"
+            )
+        try:
+            rows.read_dates([line])
+        except ValueError as err:
+            return str(err) if "expected" in str(err) or "zone" in str(err) else EXPECTED
+        if self._form.decimal == "," and "." in line:
+            return "numbers with a decimal comma have no points; write thousands without them"
+        return (
+            "write numbers there, leave it empty where there is no reading, list the text that "
+            "means so (as invalid: ['---']), or delete a line that is no row"
+        )
+
+    @property
+    def form(self) -> TableForm:
+        """How the text is written."""
+        return self._form
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line of numbers; ValueError if they are not one a name.
+
+        A cell too many, such as a decimal comma makes, would shift all that follow it.
+        """
+        cells = self._cells(line)
+        if len(cells) == len(self.names) + 1 and not cells[-1].strip():
+            cells.pop()  # a delimiter at the end of each line
+        if len(cells) != len(self.names):
+            raise ValueError
+        return cells
+
+
+class _Rows:
+    """Reads some columns of lines: those at ``places``, of which some are ``dates``."""
+
+    def __init__(self, table: TextTable, places: list[int], dates: list[bool]) -> None:
+        self._table, self._form = table, table.form
+        self._places, self._dates = places, dates
+        self._numeric = [p for p, date in zip(places, dates, strict=True) if not date]
+        self._missing = frozenset(text.lower() for text in table.form.missing)
+
+    def read(self, lines: list[str]) -> list[FloatArray]:
+        """Return the columns, each (n,); ValueError for anything else than one a name."""
+        if not lines:
+            return [np.empty(0) for _ in self._places]
+        self._check_cells(lines)
+        numbers = iter(self._read_numbers(lines).T if self._numeric else ())
+        dates = iter(self.read_dates(lines))
+        return [np.ascontiguousarray(next(dates if date else numbers)) for date in self._dates]
+
+    def read_dates(self, lines: list[str]) -> list[FloatArray]:
+        """Return the columns of dates; ValueError, which names the remedy, for other texts."""
+        found = [p for p, date in zip(self._places, self._dates, strict=True) if date]
+        cells = [self._table.cells(line) for line in lines] if found else []
+        return [seconds_since_1970([c[p] for c in cells], self._form.zone) for p in found]
+
+    def _check_cells(self, lines: list[str]) -> None:
+        mark, wanted = self._form.delimiter, len(self._table.names) - 1
+        if mark == " " or any(line.count(mark) != wanted for line in lines):
+            for line in lines:
+                self._table.cells(line)
+
+    def _read_numbers(self, lines: list[str]) -> FloatArray:
+        if self._form.decimal != ".":
+            self._check_points(lines)
+            lines = [line.replace(self._form.decimal, ".") for line in lines]
+        mark = None if self._form.delimiter == " " else self._form.delimiter
+        how = {"delimiter": mark, "usecols": self._numeric, "ndmin": 2, "comments": None}
+        try:
+            return np.loadtxt(lines, **how)
+        except ValueError:
+            return np.loadtxt(lines, converters=self._number, encoding="utf-8", **how)
+
+    def _check_points(self, lines: list[str]) -> None:
+        """Raise FileError for points among decimal commas: 1.234 is another number there."""
+        for line in lines:
+            if "." in line:
+                cells = self._table.cells(line)
+                if any("." in cells[place] for place in self._numeric):
+                    raise ValueError
+
+    def _number(self, text: str) -> float:
+        """Return a number of a table; an empty cell is a reading that is not there."""
+        text = text.strip().strip('"').strip()
+        if not text or text.lower() in self._missing:
+            return float("nan")
+        if "_" in text:
+            raise ValueError  # Python would take 1_000 for a thousand
+        return float(text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.strip().strip('"').replace(",", "."))
+    except ValueError:
+        return False
+    return True

@@ -1,1 +1,0 @@
-"""One whole task a file, shared by commands and nodes."""

@@ -1,0 +1,1 @@
+"""The running scan in a browser."""

@@ -1,0 +1,415 @@
+"""What a browser is shown of a running scan: map, error over time, states, calibration."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.calibration.calibration import (
+    ACCEPTED,
+    REJECTED,
+    RESERVED,
+    Calibration,
+    verdict_of,
+)
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.ripple.density import density
+from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray, IntArray
+from omsm_ros.errors import DataError
+from omsm_ros.quantities import LENGTH
+from omsm_ros.units import NANOMETRE_M
+
+# Which map do the points of a scan make while it grows, in bounded memory?
+
+# Smaller than any aperture: the first points may all lie in one place.
+_LEAST_SPAN_M = 1e-5
+# While so few have come, the grid is laid out anew around all of them: ten turns of a spiral, whose
+# first one tells how wide it is. After that it doubles.
+_EARLY_POINTS = 20_000
+_MARGIN = 1.05
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Where the cells lie: ``cells`` by ``cells`` of ``pitch`` [m] from ``left``, ``bottom`` [m].
+
+    generation: another one whenever the cells before mean nothing any more
+    """
+
+    left: float
+    bottom: float
+    pitch: float
+    cells: int
+    generation: int
+
+
+class RunningMap:
+    """Mean of some values in each cell of a square grid that doubles its pitch as points demand.
+
+    Memory is that of the cells, whatever the number of points; what was taken in stays in. Every
+    change of a cell has a version, so that any number of readers can ask what is new to them.
+    """
+
+    def __init__(self, values: int, cells: int = 400) -> None:
+        """values: of each point;  cells: along a side, even."""
+        self._values, self._cells = values, cells
+        self._grid: Grid | None = None
+        self._version = self._next_generation = 0
+        self._early: list[tuple[FloatArray, FloatArray, FloatArray]] | None = []
+        self._clear()
+
+    def _clear(self) -> None:
+        cells = self._cells
+        self._count = np.zeros((cells, cells), np.int64)
+        self._sum = np.zeros((cells, cells, self._values))
+        self._changed = np.zeros((cells, cells), np.int64)
+
+    @property
+    def grid(self) -> Grid | None:
+        """Where the cells lie now; None before the first point."""
+        return self._grid
+
+    @property
+    def version(self) -> int:
+        """Of the newest change."""
+        return self._version
+
+    @property
+    def points(self) -> int:
+        """Points taken in."""
+        return int(np.sum(self._count))
+
+    def restart(self) -> None:
+        """Forget all points: another part, or another scan of it."""
+        generation = 0 if self._grid is None else self._grid.generation + 1
+        self._clear()
+        self._version += 1
+        self._grid, self._early = None, []
+        self._next_generation = generation
+
+    def add(self, x: FloatArray, y: FloatArray, values: FloatArray) -> int:
+        """Take in points at ``x``, ``y`` (n,) [m] with ``values`` (n, k); return how many.
+
+        A point with anything that is no finite number is left out.
+        """
+        good = np.isfinite(x) & np.isfinite(y) & np.all(np.isfinite(values), axis=1)
+        x, y, values = x[good], y[good], values[good]
+        if not len(x):
+            return 0
+        self._remember(x, y, values)
+        if self._grid is None or not self._holds(x, y):
+            if self._early is not None:
+                self._lay_out()
+                return len(x)
+            while not self._holds(x, y):
+                self._double(x, y)
+        self._enter(x, y, values)
+        return len(x)
+
+    def _remember(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
+        if self._early is None:
+            return
+        if self._grid is not None and sum(len(part) for part, *_ in self._early) > _EARLY_POINTS:
+            self._early = None
+            return
+        self._early.append((x, y, values))
+
+    def _enter(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
+        assert self._grid is not None
+        column = ((x - self._grid.left) / self._grid.pitch).astype(np.intp)
+        row = ((y - self._grid.bottom) / self._grid.pitch).astype(np.intp)
+        self._version += 1
+        np.add.at(self._count, (row, column), 1)
+        np.add.at(self._sum, (row, column), values)
+        self._changed[row, column] = self._version
+
+    def _lay_out(self) -> None:
+        """Lay the grid around all points so far, and enter them."""
+        assert self._early is not None
+        x, y, values = (np.concatenate(parts) for parts in zip(*self._early, strict=True))
+        span = max(float(np.ptp(x)), float(np.ptp(y)), _LEAST_SPAN_M) * _MARGIN
+        left = (float(x.min()) + float(x.max()) - span) / 2
+        bottom = (float(y.min()) + float(y.max()) - span) / 2
+        if self._grid is not None:
+            self._next_generation = self._grid.generation + 1
+        self._grid = Grid(left, bottom, span / self._cells, self._cells, self._next_generation)
+        self._clear()
+        self._enter(x, y, values)
+
+    def _holds(self, x: FloatArray, y: FloatArray) -> bool:
+        assert self._grid is not None
+        size = self._grid.pitch * self._cells
+        right, top = self._grid.left + size, self._grid.bottom + size
+        return bool(
+            x.min() >= self._grid.left
+            and y.min() >= self._grid.bottom
+            and x.max() < right
+            and y.max() < top
+        )
+
+    def _double(self, x: FloatArray, y: FloatArray) -> None:
+        """Merge cells by fours into one quarter of the grid: the one that leaves room for these."""
+        old = self._grid
+        assert old is not None
+        half, size = self._cells // 2, old.pitch * self._cells
+        to_left = bool(x.min() < old.left)
+        below = bool(y.min() < old.bottom)
+        count = self._count.reshape(half, 2, half, 2).sum(axis=(1, 3))
+        total = self._sum.reshape(half, 2, half, 2, self._values).sum(axis=(1, 3))
+        self._clear()
+        rows = slice(half, None) if below else slice(0, half)
+        columns = slice(half, None) if to_left else slice(0, half)
+        self._count[rows, columns], self._sum[rows, columns] = count, total
+        self._version += 1
+        self._changed[rows, columns] = np.where(count > 0, self._version, 0)
+        self._grid = Grid(
+            old.left - size * to_left,
+            old.bottom - size * below,
+            2 * old.pitch,
+            self._cells,
+            old.generation + 1,
+        )
+
+    def since(self, version: int) -> tuple[IntArray, NDArray[np.float32]]:
+        """Return the cells that changed after ``version``: place (m,), row by row; means (m, k).
+
+        After another generation of the grid ask with 0.
+        """
+        place = np.flatnonzero(self._changed.ravel() > version)
+        count = self._count.ravel()[place]
+        means = self._sum.reshape(-1, self._values)[place] / count[:, np.newaxis]
+        return place, means.astype(np.float32)
+
+
+LAYERS = ("height", "dynamic_error", "uncertainty")
+"""Of each cell, in this order; ``height`` is the deviation where a nominal surface is known."""
+
+# One entry a second: half an hour.
+_SERIES_ENTRIES = 1800
+_SERIES_STEP_S = 1.0
+_SPECTRUM_SAMPLES = 4096
+_SPECTRUM_LINES = 512
+_SEVERITY = ("OK", "WARN", "STALE", "ERROR")
+# A node that says nothing for so long is gone.
+_FORGOTTEN_S = 10.0
+# What one cell has, and others may say of it; a stranger on /diagnostics can have any number.
+_MOST_NODES = 64
+_MOST_NAME, _MOST_MESSAGE, _MOST_VALUE = 200, 500, 5000
+# Header of the binary part: cells along a side, generation, changed cells, version.
+_HEADER = struct.Struct("<IIIQ")
+
+
+class LiveView:
+    """Takes in what nodes publish, hands out what is new to a browser; safe to share by threads."""
+
+    def __init__(
+        self, nominal: Surface | None = None, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """nominal: what heights are compared with; None shows the heights themselves."""
+        self._nominal, self._monotonic = nominal, monotonic
+        self._lock = threading.Lock()
+        self._map = RunningMap(len(LAYERS))
+        self._points = self._left_out = 0
+        self._series: deque[tuple[float, float, float, float]] = deque(maxlen=_SERIES_ENTRIES)
+        self._bin: list[tuple[float, float, float]] = []
+        self._bin_start = monotonic()
+        self._nodes: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._calibration: dict[str, Any] = {}
+        self._acceleration: NDArray[np.float64] = np.empty((0, 3))
+        self._acceleration_period = 0.0
+
+    def add_points(self, cloud: NDArray[np.void]) -> None:
+        """Take in points (n,) of the contract's fields."""
+        if not len(cloud):
+            return
+        x, y = (np.asarray(cloud[name], np.float64) for name in "xy")
+        height = np.asarray(cloud["height"], np.float64)
+        # What lies on no machine would stretch the map until the part is one cell of it.
+        x, y, height = (LENGTH.or_lost(column) for column in (x, y, height))
+        if self._nominal is not None:
+            height = height - self._nominal.height(x, y)
+        error, spread = (
+            LENGTH.or_lost(np.asarray(cloud[name], np.float64))
+            for name in ("dynamic_error", "uncertainty")
+        )
+        known = np.isfinite(error) & np.isfinite(spread)
+        with self._lock:
+            taken = self._map.add(x, y, np.column_stack([height, error, spread]))
+            self._points += len(cloud)
+            self._left_out += len(cloud) - taken
+            if known.any():
+                error, spread = error[known], spread[known]
+                self._bin.append((float(error.min()), float(error.max()), float(np.median(spread))))
+                self._close_bin()
+
+    def _close_bin(self) -> None:
+        now = self._monotonic()
+        if now - self._bin_start < _SERIES_STEP_S:
+            return
+        least, greatest, spreads = np.transpose(self._bin)
+        middle = float(np.median(spreads))
+        self._series.append((now, float(least.min()), float(greatest.max()), middle))
+        self._bin, self._bin_start = [], now
+
+    def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
+        """Take in what a node says of itself; level "OK", "WARN", "STALE" or "ERROR".
+
+        Raises DataError for one node more than a cell has.
+        """
+        name = name[:_MOST_NAME]
+        kept = {key[:_MOST_NAME]: value[:_MOST_VALUE] for key, value in values.items()}
+        message = message[:_MOST_MESSAGE]
+        state = {"name": name, "level": level, "message": message, "values": kept}
+        with self._lock:
+            if name not in self._nodes and len(self._nodes) >= _MOST_NODES:
+                raise DataError(
+                    f"states of more than {_MOST_NODES} nodes, all of this cell: {name!r} is not "
+                    "shown; end who else says such on /diagnostics, and start the viewer again"
+                )
+            self._nodes[name] = (self._monotonic(), state)
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Take in the calibration in force; another one begins another map."""
+        verdict, reasons = verdict_of(calibration)
+        with self._lock:
+            if self._calibration and self._calibration["id"] != calibration.id:
+                self._restart()
+            self._calibration = {
+                "id": calibration.id,
+                "verdict": verdict,
+                "reasons": list(reasons)[:10],
+                "delay": calibration.dynamics.low_frequency_delay,
+                "valid_up_to": calibration.valid_up_to,
+            }
+
+    def add_acceleration(self, block: AccelerationBlock) -> None:
+        """Take in a block of the accelerometer, for its spectrum."""
+        rows = np.column_stack([block.x, block.y, block.z])
+        with self._lock:
+            if block.sample_period != self._acceleration_period:
+                self._acceleration = np.empty((0, 3))
+                self._acceleration_period = block.sample_period
+            kept = np.concatenate([self._acceleration, rows])
+            self._acceleration = kept[-_SPECTRUM_SAMPLES:]
+
+    def restart(self) -> None:
+        """Begin another map."""
+        with self._lock:
+            self._restart()
+
+    def _restart(self) -> None:
+        self._map.restart()
+        self._series.clear()
+        self._points = self._left_out = 0
+
+    def news(self, generation: int, version: int) -> tuple[bytes, int, int] | None:
+        """Return what changed on the map since a browser's generation and version; None if nothing.
+
+        A binary message: header, places (m) as uint32, then each layer (m) as float32 in nm; and
+        the generation and version that the browser then knows.
+        """
+        with self._lock:
+            grid = self._map.grid
+            if grid is None:
+                return None
+            since = version if generation == grid.generation else 0
+            newest = self._map.version
+            if generation == grid.generation and newest == version:
+                return None
+            place, means = self._map.since(since)
+        content = _HEADER.pack(grid.cells, grid.generation, len(place), newest)
+        layers = (means / np.float32(NANOMETRE_M)).T
+        packed = content + place.astype("<u4").tobytes() + layers.astype("<f4").tobytes()
+        return packed, grid.generation, newest
+
+    def state(self) -> dict[str, Any]:
+        """Return everything but the map, as JSON values."""
+        with self._lock:
+            now = self._monotonic()
+            nodes = [
+                {**state, "silent": now - when > _FORGOTTEN_S}
+                for when, state in self._nodes.values()
+            ]
+            grid = self._map.grid
+            return {
+                "points": self._points,
+                "left_out": self._left_out,
+                "compared": self._nominal is not None,
+                "grid": None if grid is None else _grid_entry(grid),
+                "light": _light(nodes, self._calibration),
+                "nodes": nodes,
+                "calibration": self._calibration,
+                "series": [(when - now, *rest) for when, *rest in self._series],
+                "spectrum": self._spectrum(),
+            }
+
+    def _spectrum(self) -> dict[str, Any] | None:
+        rows, period = self._acceleration, self._acceleration_period
+        if not len(rows) or not np.all(np.isfinite(rows)):
+            return None
+        try:
+            found = [density(column - column.mean(), period) for column in rows.T]
+        except DataError:  # too few as yet
+            return None
+        total = np.sqrt(np.sum([one.density for one in found], axis=0))
+        # The greatest of neighbours, so that no line is lost.
+        cuts = np.unique(np.linspace(0, len(total), _SPECTRUM_LINES, endpoint=False).astype(int))
+        peaks = np.maximum.reduceat(total, cuts)
+        return {"frequency": found[0].frequency[cuts].tolist(), "amplitude": peaks.tolist()}
+
+
+def _grid_entry(grid: Grid) -> dict[str, float]:
+    return {
+        "left": grid.left,
+        "bottom": grid.bottom,
+        "pitch": grid.pitch,
+        "cells": grid.cells,
+        "generation": grid.generation,
+    }
+
+
+def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the worst of: states of nodes, calibration, and what the corrector measures.
+
+    Green only if every node is well, the calibration was accepted without reservation, and the
+    light of the measurement, which a corrector reports, is green too.
+    """
+    reasons = [f"{n['name']}: {n['message']}" for n in nodes if n["level"] != "OK"]
+    reasons += [f"{n['name']}: says nothing any more" for n in nodes if n["silent"]]
+    worst = max((n["level"] for n in nodes), key=_SEVERITY.index, default="STALE")
+    if not nodes:
+        reasons.append("no node has said anything yet")
+    against = _against(calibration)
+    reasons += [against] * bool(against)
+    measured = [n["values"] for n in nodes if n["values"].get("light") in ("amber", "red")]
+    for values in measured:
+        reasons += [f"measurement: {why}" for why in values.get("light_reasons", "").split("; ")]
+    red = worst == "ERROR" or any(n["silent"] for n in nodes) or _is_rejected(calibration)
+    red = red or any(values["light"] == "red" for values in measured)
+    colour = "red" if red else "amber" if reasons else "green"
+    return {"colour": colour, "reasons": reasons[:20]}
+
+
+def _is_rejected(calibration: Mapping[str, Any]) -> bool:
+    """Return whether the calibration in force was rejected."""
+    return bool(calibration.get("verdict") == REJECTED)
+
+
+def _against(calibration: Mapping[str, Any]) -> str:
+    """Return what speaks against the calibration in force; empty if nothing does."""
+    if not calibration:
+        return "no calibration yet"
+    verdict = str(calibration["verdict"])
+    if verdict == REJECTED:
+        return "the calibration was rejected"
+    if not verdict.startswith(ACCEPTED) or verdict.startswith(RESERVED):
+        return f"the calibration is {verdict or 'not judged'}"
+    return ""

@@ -1,0 +1,94 @@
+"""Sentences for the codes of errors and findings.
+
+The core states what it found as a code and values. A sentence for people is made here, from the
+template of that code, in the words of its audience: an option of the command line, a parameter of
+a node, or an argument of a Python function.
+
+A template is a string in the syntax of :meth:`str.format`. After the colon stands either a format
+of Python or how :mod:`omsm_ros.readable` writes the number:
+
+| field | written as |
+|---|---|
+| ``{noise:m}``, ``{lag:s}``, ``{rate:Hz/4}`` | quantity with SI prefix, to 3 or 4 digits |
+| ``{share:%}`` | percent |
+| ``{p:chance}`` | ``p = 0.02`` |
+| ``{n:count}`` | number of things, ``290 011`` |
+| ``{factor:plain/2}`` | number without unit, to 2 digits |
+| ``{opt.dwell}`` | ``--dwell``, ``parameter 'dwell'`` or ``'dwell'``, for the audience |
+
+To add a message, add its code and template to the dictionary of its room in this package.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import string
+from collections.abc import Mapping
+from contextvars import ContextVar
+from functools import lru_cache
+from typing import Any
+
+from omsm_ros import readable
+
+COMMAND, NODE, PYTHON = "command", "node", "python"
+AUDIENCE: ContextVar[str] = ContextVar("audience", default=PYTHON)
+"""For whom sentences are made; commands and nodes set it when they start."""
+
+_UNITS = {"m", "s", "Hz", "rad", "m/s", "m/s²", "ppm", "K", "°C", "rpm", "kg", "samples/s"}
+
+
+def sentence(code: str, values: Mapping[str, Any]) -> str:
+    """Return the sentence for ``code`` with ``values``; a code without a template is a text."""
+    template = templates().get(code)
+    if template is None:
+        return code
+    return _Formatter().vformat(template, (), {**values, "opt": _Options()})
+
+
+@lru_cache(maxsize=1)
+def templates() -> Mapping[str, str]:
+    """Return the templates of all rooms by code.
+
+    Raises ValueError if two rooms use one code.
+    """
+    found: dict[str, str] = {}
+    for room in pkgutil.iter_modules(__path__):
+        mapping = importlib.import_module(f"{__name__}.{room.name}").TEMPLATES
+        if twice := found.keys() & mapping.keys():
+            raise ValueError(f"messages: codes {sorted(twice)} stand in two rooms")
+        found |= mapping
+    return found
+
+
+class _Options:
+    """Write the name of an option for the audience: ``opt.dwell`` → ``--dwell``."""
+
+    def __getattr__(self, name: str) -> str:
+        audience = AUDIENCE.get()
+        if audience == COMMAND:
+            return "--" + name.replace("_", "-")
+        return f"parameter {name!r}" if audience == NODE else repr(name)
+
+
+class _Formatter(string.Formatter):
+    """Format numbers as :mod:`omsm_ros.readable` writes them where the format names a unit."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        kind, _, digits = (
+            format_spec.rpartition("/") if "/" in format_spec else (format_spec, "", "")
+        )
+        if format_spec in _UNITS:
+            kind, digits = format_spec, ""
+        more = (int(digits),) if digits else ()
+        if kind in _UNITS:
+            return readable.quantity(value, kind, *more)
+        if kind == "%":
+            return readable.percent(value, *more)
+        if kind == "plain":
+            return readable.plain(value, *more)
+        if kind == "chance":
+            return readable.chance(value)
+        if kind == "count":
+            return readable.count(value)
+        return str(super().format_field(value, format_spec))

@@ -1,0 +1,151 @@
+"""What every driver node does: a thread reads the device, its blocks are published."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from omsm_msgs.msg import AxisBlock, DistanceBlock
+from rclpy.publisher import Publisher
+from std_msgs.msg import String
+
+from omsm_ros.core.calibration.calibration import PROBE
+from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.instruments.blocks import BlockPair
+from omsm_ros.instruments.reader import DeviceReader, State
+from omsm_ros.instruments.stream import StreamDevice
+from omsm_ros.io import json_and_yaml, message_mapping
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
+from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
+from omsm_ros.quantities import Parameter
+
+_FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown")
+# Shorter pauses are those between two motions of a step test.
+_SILENCE_S = 2.0
+_SILENCE_SAMPLES = 5
+_END_S = 5.0
+
+
+class DriverNode(ManagedNode):
+    """Publishes a device's blocks; whatever happens on the wire, the node stays."""
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Sequence[Parameter],
+        make: Callable[[dict[str, Any], Callable[[], int]], StreamDevice],
+        *,
+        axes: str | None = None,
+        distance: str | None = None,
+        settings: str | None = None,
+    ) -> None:
+        """axes, distance: topics of the blocks;  settings: of what a calibration belongs to.
+
+        None = it has none.
+        """
+        frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
+        if distance:
+            frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
+        super().__init__(name, (*parameters, *frames))
+        self._make = make
+        self._axes_topic, self._distance_topic = axes, distance
+        self._settings_topic = settings
+        self._settings: Publisher | None = None
+        self._axes: Publisher | None = None
+        self._distance: Publisher | None = None
+        self._messages = message_mapping.ros_messages()
+
+    def hardware_id(self) -> str:
+        """Return the port."""
+        return str(self.values.get("port", ""))
+
+    def configure(self, undo: ExitStack) -> None:
+        """Make the device, which nobody touches yet."""
+        self._device = self._make(self.values, lambda: self.get_clock().now().nanoseconds)
+        self._reader = DeviceReader(
+            self._device,
+            self._publish,
+            self.get_logger().info,
+            self.get_logger().warning,
+            connected=self._tell_settings,
+        )
+        self._recent, self._flow = RecentIncrease(), Flow()
+        self._reported: dict[str, object] = {}
+        if self._settings_topic:
+            self._settings = publish_on(
+                undo=undo, node=self, kind=String, topic=self._settings_topic, qos=LATCHED_QOS
+            )
+        if self._axes_topic:
+            self._axes = self.publish_on(undo, AxisBlock, self._axes_topic)
+        if self._distance_topic:
+            self._distance = self.publish_on(undo, DistanceBlock, self._distance_topic)
+
+    def activate(self, undo: ExitStack) -> None:
+        """Begin to read the device."""
+        stop = threading.Event()
+        thread = threading.Thread(target=self._reader.run, args=(stop,), daemon=True)
+        undo.callback(thread.join, timeout=_END_S)
+        undo.callback(stop.set)
+        thread.start()
+
+    def _publish(self, blocks: Sequence[BlockPair]) -> None:
+        self._tell_settings()
+        for axes, distance in blocks:
+            if axes is not None and self._axes is not None:
+                frame = self.values["machine_frame"]
+                self._axes.publish(message_mapping.axis_message(self._messages, axes, frame))
+            if distance is not None and self._distance is not None:
+                frame = self.values["probe_frame"]
+                self._distance.publish(
+                    message_mapping.distance_message(self._messages, distance, frame)
+                )
+
+    def _tell_settings(self) -> None:
+        """Tell them before the first samples that were taken with them, and who comes later."""
+        if self._settings is None:
+            return
+        named = {"device": self.values["device"], **self._device.settings}
+        reported = {f"{PROBE}{name}": value for name, value in named.items()}
+        if reported != self._reported:
+            self._reported = reported
+            self._settings.publish(String(data=json_and_yaml.text_of(reported)))
+
+    def report(self) -> Report:
+        """Return what became of every sample, and what is wrong now."""
+        counts, now = self._device.counts(), time.monotonic()
+        self._flow.update(int(counts["decoded"]), now)
+        values: dict[str, object] = {**self._device.identity, "state": self._reader.state.value}
+        values |= counts | {"connections": self._reader.connections}
+        values["rate_hz"] = round(self._flow.rate, 3)
+        for topic, publisher in self._both():
+            values[f"{topic}_subscribers"] = publisher.get_subscription_count()
+        report = Report(f"reading at {self._flow.rate:.6g} Hz", values)
+        if self._reader.trouble:
+            report.add(ERROR, self._reader.trouble)
+        self._add_faults(report, counts, now)
+        self._add_silence(report, now)
+        return report
+
+    def _both(self) -> list[tuple[str, Publisher]]:
+        both = ((self._axes_topic, self._axes), (self._distance_topic, self._distance))
+        return [(topic, publisher) for topic, publisher in both if topic and publisher]
+
+    def _add_faults(self, report: Report, counts: dict[str, float], now: float) -> None:
+        faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
+        if seen := self._recent.update(faults, now):
+            text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
+            report.add(WARN, f"just now: {text}")
+
+    def _add_silence(self, report: Report, now: float) -> None:
+        if self._reader.state is not State.READING:
+            return
+        patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])
+        silent = self._flow.silent(now)
+        if silent is None:
+            report.add(STALE, "connected, but no sample has come yet")
+        elif silent > patience:
+            report.add(STALE, f"no sample for {silent:.0f} s")

@@ -1,0 +1,1 @@
+"""Whole tasks, shared by commands and nodes."""

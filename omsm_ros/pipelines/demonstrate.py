@@ -1,0 +1,373 @@
+"""The demonstration: what came of it, beside the truth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED
+from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
+from omsm_ros.core.lti.discretisation import discretise
+from omsm_ros.core.lti.recursion import Recursion, past_motion
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.errors import OmsmError, printable
+from omsm_ros.instruments.emulator_factory import emulated
+from omsm_ros.io import bags
+from omsm_ros.io.calibration_file import load_calibration
+from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.files import (
+    CLOUD,
+    DEVIATION,
+    FORM,
+    REPORT,
+    SUMMARY,
+    SYSTEMATIC,
+    save_json,
+    save_text,
+)
+from omsm_ros.io.results import CloudFile
+from omsm_ros.pipelines import measure as measurement
+from omsm_ros.pipelines import publish as publication
+from omsm_ros.pipelines.correct import correct_bag
+from omsm_ros.pipelines.measure import Judgement, with_sources
+from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
+from omsm_ros.readable import quantity
+from omsm_ros.report import response_figures, style
+from omsm_ros.report.measurement.figures import levelled, overview_figure, surface_figures
+from omsm_ros.report.measurement.surface_map import CloudView
+from omsm_ros.twin.cell import Probe, Recording
+from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.twin.true_response import TrueResponse
+from omsm_ros.twin.truth import TruthComparison, departure_from_truth
+from omsm_ros.units import PPM
+
+# The demonstration: where its results go, how the twin is set, what each node is told.
+
+# Where an emulated device has to be on TCP: one of these ports of this machine.
+_FIRST_PORT, _PORTS = 20_000, 10_000
+# The paper's spiral, as fast as emulated lines carry it; nine bytes a sample over RS-422 at
+# 691 200 baud are 7.6 times faster than real at most, and of two devices one may lag behind.
+_LAPSE, _RADIUS_M = 20.0, 12.7e-3
+_SLOW_LAPSE, _SMALL_RADIUS_M = 3.0, 3e-3
+OVERVIEW = "overview.png"
+_MARK = "made_by_omsm_demo.txt"
+_RESULTS = (CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, OVERVIEW)
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """Where the results go, and how the twin is set.
+
+    time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
+        None = as fast, and as large, as the device's line allows
+    device: what the emulated probe speaks
+    disturbance_file: what is wrong with the machine, None for nothing
+    view: whether a browser may look on
+    """
+
+    out: Path
+    seed: int = 1
+    time_lapse: float | None = None
+    start_radius: float | None = None
+    device: str = "six_channel"
+    disturbance_file: Path | None = None
+    view: bool = False
+    sample_period: float = field(default=1e-3, init=False)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What the emulated cell does."""
+        return Scenario(seed=self.seed, start_radius=self.radius, sample_period=self.sample_period)
+
+    @property
+    def lapse(self) -> float:
+        """How much faster than real time the cell plays [1]."""
+        slow = emulated(self.device).baud_rate > 0
+        return self.time_lapse or (_SLOW_LAPSE if slow else _LAPSE)
+
+    @property
+    def radius(self) -> float:
+        """Of the start of the spiral [m]."""
+        slow = emulated(self.device).baud_rate > 0
+        return self.start_radius or (_SMALL_RADIUS_M if slow else _RADIUS_M)
+
+    @cached_property
+    def disturbances(self) -> Disturbances:
+        """What is wrong with the machine."""
+        return load_disturbances(self.disturbance_file) if self.disturbance_file else NOTHING
+
+    @property
+    def calibration_file(self) -> Path:
+        """Written by the calibrator node."""
+        return self.out / "calibration.json"
+
+    @property
+    def bag(self) -> Path:
+        """Written by the recorder node."""
+        return self.out / "scan.mcap"
+
+    @property
+    def link(self) -> str:
+        """The emulated port."""
+        if emulated(self.device).tcp:
+            return _tcp_link()
+        return str((self.out / "cell").absolute())
+
+    @property
+    def link_beside(self) -> str:
+        """The emulated port of the second device; empty without one."""
+        if (beside := emulated(self.device).beside) is None:
+            return ""
+        return _tcp_link() if beside.tcp else f"{self.link}_beside"
+
+    @property
+    def step_test_samples(self) -> int:
+        """Samples of the step test."""
+        return len(planned_test_of(self.scenario, self.disturbances).axes)
+
+    @property
+    def scan_samples(self) -> int:
+        """Samples of the scan."""
+        return round(spiral_of(self.scenario).duration / self.sample_period)
+
+    def emulator_parameters(self) -> dict[str, object]:
+        """Return ROS parameters of the emulator."""
+        return {
+            "device": self.device,
+            "link_beside": self.link_beside,
+            "time_lapse": self.lapse,
+            "seed": self.seed,
+            "start_radius": self.radius,
+            "sample_period": self.sample_period,
+            "disturbances": str(self.disturbance_file.absolute()) if self.disturbance_file else "",
+        }
+
+    def driver_parameters(self) -> dict[str, object]:
+        """Return ROS parameters of the driver."""
+        fixed = {"device": self.device, "port": self.link, "sample_period": self.sample_period}
+        return fixed | emulated(self.device).driver
+
+    def beside_parameters(self) -> tuple[str, dict[str, object]] | None:
+        """Return the node that reads the second device, and its ROS parameters; None without."""
+        if (beside := emulated(self.device).beside) is None:
+            return None
+        fixed = {"port": self.link_beside, "sample_period": self.sample_period}
+        return beside.node, fixed | beside.driver
+
+    def settings(self) -> dict[str, object]:
+        """Return what the calibration will belong to."""
+        return {
+            "machine": "digital twin of the paper's cell",
+            "fixture": "twin",
+            "probe_rate_hz": 1 / self.sample_period,
+            "time_lapse": self.lapse,
+            "seed": self.seed,
+        }
+
+    @property
+    def nominal_file(self) -> Path:
+        """What the mirror should be."""
+        return self.out / NOMINAL
+
+    def prepare(self) -> None:
+        """Make the folder and clear it of an earlier run's results.
+
+        OmsmError if it holds anything, and is not the folder of a demonstration.
+        """
+        _ = self.disturbances  # a file that cannot be read is reported before anything is cleared
+        mark = self.out / _MARK
+        # A scan and a calibration of a real machine have the same names.
+        if self.out.is_dir() and any(self.out.iterdir()) and not mark.is_file():
+            raise OmsmError(
+                f"{str(self.out)!r} holds files that no demonstration made; give a folder that is "
+                "empty or does not exist yet"
+            )
+        save_text(mark, "Whatever is in this folder, the next demonstration replaces.\n")
+        stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
+        for path in stale:
+            if path.is_dir():
+                raise OmsmError(f"{str(path)!r} is a folder and stands in the way; remove it")
+            path.unlink(missing_ok=True)
+        write_nominal(self.nominal_file)
+        for log in (self.out / "log").glob("*.log"):
+            log.unlink()
+
+
+def _tcp_link() -> str:
+    return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
+
+
+# The step test begins at rest.
+_REST_SAMPLES = 100
+RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
+TITLE = "Paraboloid mirror measured on the emulated cell"
+_REGISTERING = measurement.Registering(("piston", "tip", "tilt"))
+
+
+def conclude(plan: Demonstration) -> dict[str, Any]:
+    """Correct the recorded bag offline, compare with the truth, write all results."""
+    calibration = load_calibration(plan.calibration_file)
+    options = with_sources(CorrectionOptions(), calibration, NOTHING_STATED, PAPER_MIRROR)
+    done = correct_bag(
+        plan.bag, calibration, plan.out / CLOUD, options=options, nominal=PAPER_MIRROR
+    )
+    cloud = CloudFile(plan.out / CLOUD).read()
+    view = publication.view_of(cloud, plan.sample_period)
+    if view is None:
+        raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
+    recording = scan_of(plan.scenario, plan.disturbances)
+    step_test = planned_test_of(plan.scenario, plan.disturbances)
+    judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.freedoms)
+    summary = measurement.summarise(plan.bag, done, calibration, judgement)
+    measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
+    summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
+    summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
+    summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
+    summary["response"] = response_errors(calibration, true_response(step_test))
+    live = live_points(plan.bag)
+    summary["live_equals_offline"] = same_points(live, cloud)
+    summary["live_points"] = len(live)
+    index = cloud["sample"].astype(np.int64)
+    figures = surface_figures(
+        view,
+        PAPER_MIRROR,
+        true_height=recording.surface_height[index],
+        true_error_left=(recording.probe_motion - recording.axes.z)[index] + view.dynamic_error,
+    )
+    figures |= calibration_figures(calibration, step_test)
+    (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true_response(step_test)))
+    save_json(plan.out / SUMMARY, summary)
+    surface = publication.map_of(view, PAPER_MIRROR, plan.out)
+    publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
+    return summary
+
+
+def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
+    """Return the entries of the summary that only the twin's truth can give; lengths in metres."""
+    truth: TruthComparison = departure_from_truth(
+        recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
+    )
+    probe = Probe()
+    floor = float(np.hypot(probe.noise, probe.resolution / np.sqrt(12)))
+    entries = asdict(truth)
+    entries["surface_deviation"]["probe_noise_and_resolution"] = floor
+    return entries
+
+
+def true_response(recording: Recording) -> TrueResponse:
+    """Return what an identification should have found."""
+    if recording.truth is None:
+        raise OmsmError("this recording comes without the truth behind it; record it on the twin")
+    return recording.truth.response
+
+
+def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[str, float]]:
+    """Compare the identified with the true response: relative gain error [1], phase error [deg]."""
+    frequency = np.array(RESPONSE_FREQUENCIES_HZ)
+    ratio = calibration.dynamics.response(frequency) / true.response(frequency)
+    gain, phase = np.abs(ratio) - 1, np.angle(ratio, deg=True)
+    return [
+        {"frequency": float(f), "gain_error": float(g), "phase_error_deg": float(p)}
+        for f, g, p in zip(frequency, gain, phase, strict=True)
+    ]
+
+
+def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
+    """Draw one wide picture: map before in µm, after in nm, identified and true response."""
+    raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
+    figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
+    return style.png(figure, dpi=120)
+
+
+def live_points(bag: Path) -> NDArray[np.void]:
+    """Return all points the corrector node published while ``bag`` was recorded, in order."""
+    with bags.BagReader(bag) as reader:
+        clouds = [points for _, points in reader.records(bags.POINTS_TOPIC)]
+    return np.concatenate(clouds) if clouds else np.empty(0, np.dtype(list(CLOUD_FIELDS)))
+
+
+def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
+    """Return True if every field of every point is the same to the last bit."""
+    return len(live) == len(stored) and all(
+        live[name].tobytes() == stored[name].tobytes() for name, _ in CLOUD_FIELDS
+    )
+
+
+def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
+    """Draw a Bode plot against the truth, and what the model makes of the step test."""
+    axes, period = step.axes, calibration.sample_period
+    recursion = Recursion(discretise(calibration.dynamics, period))
+    recursion.start(past_motion(axes.z[:_REST_SAMPLES]))
+    edges = response_figures.step_response(
+        np.arange(len(axes)) * period,
+        axes.z,
+        -step.distance.distance / calibration.static_gain,
+        recursion.run(axes.z),
+    )
+    bode = response_figures.bode(calibration, true_response(step), period)
+    return {"bode": style.png(bode), "step_response": style.png(edges)}
+
+
+def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
+    """Return the result for the terminal."""
+    where = printable(os.path.relpath(plan.out))
+    written = ", ".join(summary["files"].values())
+    rows = [*sample_rows(summary), *_accuracy_rows(summary), ("written", f"{written} in {where}")]
+    width = max(len(name) for name, _ in rows)
+    body = "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
+    return f"\n{TITLE}\n\n{body}\n"
+
+
+def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    """Yield names and texts of where the samples went."""
+    for stream, account in summary["samples"].items():
+        reasons = "".join(f", {n} {reason}" for reason, n in account["counted"].items() if n)
+        value = f"{account['received']} received, {account['corrected']} corrected{reasons}"
+        yield f"samples of {stream}", value
+    yield "live cloud equals offline", _live_text(summary)
+
+
+def _live_text(summary: dict[str, Any]) -> str:
+    """Say whether the corrector did live what was done offline, and what to do if it could not."""
+    if summary["live_equals_offline"]:
+        return "to the last bit"
+    left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]
+    if left_out <= 0:
+        return "NO"
+    return (
+        f"NO: {left_out} points were not made live, for this computer was too busy at that speed; "
+        "give a smaller --time-lapse"
+    )
+
+
+def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    before, after = summary["dynamic_error_before"], summary["dynamic_error_after"]
+    yield "dynamic error before", _spread(before)
+    yield "  after correction", _spread(after)
+    surface = summary["surface_deviation"]
+    floor = quantity(surface["probe_noise_and_resolution"], "m")
+    yield (
+        "cloud from true surface",
+        f"rms {quantity(surface['rms'], 'm')}; the probe alone has {floor}",
+    )
+    for row in summary["response"]:
+        yield (
+            f"G at {quantity(row['frequency'], 'Hz')}, off by",
+            f"{quantity(row['gain_error'] / PPM, 'ppm', signed=True)}, "
+            f"{quantity(row['phase_error_deg'], '°', signed=True)}",
+        )
+
+
+def _spread(spread: dict[str, float]) -> str:
+    pv, rms = quantity(spread["peak_to_valley"], "m"), quantity(spread["rms"], "m")
+    return f"{pv} PV, {rms} rms (by area)"

@@ -1,0 +1,197 @@
+"""Is this computer fit to run a cell? Python, packages, ROS, discovery, ports, clock, disk."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
+from omsm_ros.instruments.transport import serial_ports
+
+FINE, DOUBTFUL, FAULTY = "fine", "doubtful", "faulty"
+
+_PYTHONS = ((3, 10), (3, 13))  # the ones that have wheels of ROS 2 Jazzy
+_PACKAGES = ("numpy", "scipy", "control", "rosbags", "pyserial", "PyYAML", "jsonschema")
+_EXTRAS = {
+    "SurfaceTopography": "other instruments' maps",
+    "h5py": "HDF5 files",
+    "nptdms": "TDMS files",
+    "websockets": "the live page",
+    "sqlalchemy": "the catalogue",
+    "distributed": "campaigns on several computers",
+    "shtab": "completion in the shell",
+}
+# The demonstration's bag of axes, probe and points has 95 bytes a sample: 0.34 GB an hour at 1 kHz.
+_BYTES_PER_HOUR = 95 * 1000 * 3600
+_ENOUGH_HOURS = 8.0
+_DISCOVERY_TIMEOUT_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that was looked at.
+
+    state: "fine", "doubtful" (works, but may not for long) or "faulty"
+    found: what is there;  remedy: what to do about it, empty where nothing is to be done
+    """
+
+    name: str
+    state: str
+    found: str
+    remedy: str = ""
+
+
+def examine_host(folder: Path, port: str = "") -> list[Check]:
+    """Look at everything that a cell on this computer depends on.
+
+    folder: where recordings will lie;  port: a serial device that must be there, such as
+    ``/dev/ttyUSB0``; empty to list those that are
+    """
+    return [
+        _python(),
+        *_packages(),
+        _open_files(),
+        *_ros(os.environ),
+        _serial(port),
+        _clock(_kernel_clock_synchronised),
+        _disk(folder),
+    ]
+
+
+def _python() -> Check:
+    name = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    low, high = (".".join(map(str, limit)) for limit in _PYTHONS)
+    if _PYTHONS[0] <= sys.version_info[:2] <= _PYTHONS[1]:
+        return Check("Python", FINE, name)
+    return Check("Python", FAULTY, name, f"use Python {low} to {high}: make PYTHON=… setup")
+
+
+def _packages() -> Iterator[Check]:
+    missing, found = [], []
+    for package in _PACKAGES:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            missing.append(package)
+    if missing:
+        remedy = f"pip install {' '.join(missing)}"
+        yield Check("packages", FAULTY, f"missing: {', '.join(missing)}", remedy)
+    else:
+        yield Check("packages", FINE, ", ".join(found))
+    absent = {p: use for p, use in _EXTRAS.items() if importlib.util.find_spec(p) is None}
+    if absent:
+        use = ", ".join(f"{package} ({use})" for package, use in absent.items())
+        yield Check("optional packages", FINE, f"not installed: {use}")
+
+
+def _open_files() -> Check:
+    """Return whether a process may hold as many files as nodes and commands do."""
+    most = open_files()
+    if most >= FEWEST_OPEN_FILES:
+        return Check("open files", FINE, f"{most} at most" if most < math.inf else "any number")
+    found = f"a process may hold {most} open, and may need {FEWEST_OPEN_FILES}"
+    return Check("open files", FAULTY, found, MORE_FILES)
+
+
+def _ros(environment: os._Environ[str]) -> Iterator[Check]:
+    """Yield whether nodes can start, and whether they find each other."""
+    if importlib.util.find_spec("rclpy") is None:
+        yield Check(
+            "ROS 2", DOUBTFUL, "not found: the offline commands work, nodes do not",
+            "'make setup' and '. ./env.sh', or source /opt/ros/jazzy/setup.bash",
+        )  # fmt: skip
+        return
+    if importlib.util.find_spec("omsm_msgs") is None:
+        yield Check("ROS 2", FAULTY, "rclpy, but no omsm_msgs", "build it: make setup; . ./env.sh")
+        return
+    yield Check("ROS 2", FINE, environment.get("ROS_DISTRO", "jazzy, from PyPI"))
+    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    domain = environment.get("ROS_DOMAIN_ID", "0")
+    found = f"domain {domain}, range {reach}"
+    if reach == "LOCALHOST":
+        yield Check("DDS settings", FINE, found)
+    else:
+        yield Check(
+            "DDS settings", DOUBTFUL, f"{found}: other computers may command these nodes",
+            "export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or a ROS_DOMAIN_ID of your own",
+        )  # fmt: skip
+    yield _discovery()
+
+
+def _discovery() -> Check:
+    """Return whether two processes' worth of ROS find each other and pass a message."""
+    if open_files() < FEWEST_OPEN_FILES:
+        return Check("DDS discovery", FAULTY, "not evaluated: too few open files", MORE_FILES)
+    command = [sys.executable, "-m", "omsm_ros.nodes.discovery_check"]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_DISCOVERY_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        found = f"no message within {_DISCOVERY_TIMEOUT_S:g} s"
+    else:
+        if done.returncode == 0:
+            return Check("DDS discovery", FINE, done.stdout.strip())
+        found = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    remedy = "allow UDP multicast on the loopback interface, or set ROS_STATIC_PEERS=127.0.0.1"
+    return Check("DDS discovery", FAULTY, found, remedy)
+
+
+def _serial(port: str) -> Check:
+    ports = serial_ports()
+    if port and port not in ports and not Path(port).exists():
+        there = f"; there are: {', '.join(ports)}" if ports else "; there is none"
+        return Check(
+            "serial port", FAULTY, f"no {port}{there}", "plug the device in; name its port"
+        )
+    wanted = [port] if port else ports
+    closed = [p for p in wanted if not os.access(p, os.R_OK | os.W_OK)]
+    if closed:
+        remedy = "sudo usermod -aG dialout $USER, then log in again"
+        return Check("serial port", FAULTY, f"no permission to open {', '.join(closed)}", remedy)
+    return Check("serial port", FINE, ", ".join(wanted) or "none on this computer")
+
+
+def _clock(synchronised: Callable[[], bool | None]) -> Check:
+    """Return whether stamps of this computer can be compared with those of another."""
+    remedy = "sudo timedatectl set-ntp true, where stamps of several computers are compared"
+    by_hand = "see that chrony or another NTP client runs, where several computers are compared"
+    states = {
+        True: Check("clock", FINE, "synchronised"),
+        False: Check("clock", DOUBTFUL, "not synchronised", remedy),
+        None: Check("clock", DOUBTFUL, "not evaluated: timedatectl says nothing here", by_hand),
+    }
+    return states[synchronised()]
+
+
+def _kernel_clock_synchronised() -> bool | None:
+    """Return what systemd says of the clock; None where it says nothing."""
+    try:
+        done = subprocess.run(
+            ["timedatectl", "show", "--property=NTPSynchronized", "--value"],
+            capture_output=True, text=True, timeout=5.0, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return {"yes": True, "no": False}.get(done.stdout.strip())
+
+
+def _disk(folder: Path) -> Check:
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not os.access(there, os.W_OK):
+        return Check("disk", FAULTY, f"no permission to write in {there}", "choose another folder")
+    hours = shutil.disk_usage(there).free / _BYTES_PER_HOUR
+    found = f"room for {hours:.0f} hours of recording at 1 kHz in {there}"
+    if hours < _ENOUGH_HOURS:
+        return Check("disk", DOUBTFUL, found, "free some space, or record elsewhere")
+    return Check("disk", FINE, found)

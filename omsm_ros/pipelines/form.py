@@ -1,0 +1,381 @@
+"""From a cloud and a nominal surface to ``form.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.comparison.stated_errors import Fields, Measurement
+from omsm_ros.core.correction.systematic import ScanFields
+from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.form.deviation_map import conformity
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.registration.degrees_of_freedom import MOVES, Registration
+from omsm_ros.core.registration.placement import (
+    FREEDOMS,
+    Aperture,
+    Placed,
+    Portion,
+    Portions,
+    placed,
+)
+from omsm_ros.core.registration.register import register
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.deviation import unlike
+from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.measured_points import MeasuredPoints, each_once
+from omsm_ros.errors import FileError
+from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC, save_json
+from omsm_ros.io.maps.read_map import read_points
+from omsm_ros.io.maps.vertex_file import write_ply
+from omsm_ros.io.results import CloudFile, load_fields, read_summary
+from omsm_ros.units import NOT_USED, LengthUnits
+
+# Points of a measurement in portions, with what its systematic errors do to them.
+
+_PORTION = 131_072
+
+
+@dataclass(frozen=True)
+class MeasurementMeasuredPortions:
+    """portions: reads all points from the start;  sources: of their systematic effects, by name
+
+    systematic: whether the effects of systematic errors are known at all
+    notes: what a reader of the results should know about how the file was understood
+    even: whether the points are those of an evenly spaced grid
+    bounds: names of the sources of which only an upper bound is known
+    missing: how many points of a map, beside these, have no height
+    """
+
+    portions: Portions
+    sources: tuple[str, ...]
+    systematic: bool
+    notes: tuple[str, ...] = ()
+    even: bool = False
+    bounds: tuple[str, ...] = ()
+    missing: int = 0
+
+    def form(
+        self,
+        surface: Surface,
+        asked: Sequence[str],
+        aperture: Aperture | None = None,
+        filters: tuple[float | None, float | None] = (None, None),
+    ) -> Form:
+        """Return the form against ``surface``, with all that is known of the points."""
+        return analyse_form(
+            surface,
+            self.portions,
+            asked,
+            sources=self.sources,
+            bounds=self.bounds,
+            aperture=aperture,
+            even=self.even,
+            filters=filters,
+        )
+
+
+def open_measurement(path: Path, units: LengthUnits | None = None) -> MeasurementMeasuredPortions:
+    """Open a result folder, a cloud of ours, or a map or cloud of any other format.
+
+    Our own clouds are read in bounded memory, with the fields that lie beside them.
+    units: of a file that does not carry them. Raises FileError for what cannot be read.
+    """
+    file = path / CLOUD if path.is_dir() else path
+    if not file.exists():
+        raise FileError(
+            f"no cloud at {str(file)!r}; give a cloud, a map, or the folder of a measurement"
+        )
+    try:
+        cloud = CloudFile(file)
+    except FileError:
+        points = each_once(read_points(file, units))
+        gridded = as_grid(points) is not None
+        return MeasurementMeasuredPortions(
+            lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
+        )
+    notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
+    beside = file.with_name(SYSTEMATIC)
+    fields = load_fields(beside) if beside.is_file() else None
+    if fields is None:
+        return MeasurementMeasuredPortions(lambda: _portions(cloud, None), (), False, notes)
+    return MeasurementMeasuredPortions(
+        lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
+    )
+
+
+def _slices(points: MeasuredPoints) -> Iterator[Portion]:
+    for first in range(0, len(points), _PORTION):
+        part = slice(first, first + _PORTION)
+        x, y, height = points.x[part], points.y[part], points.height[part]
+        yield Portion(x, y, height, np.empty((0, len(x))))
+
+
+def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[Portion]:
+    first = 0
+    for rows in cloud.portions(_PORTION):
+        x, y, height = (rows[name].astype(np.float64) for name in ("x", "y", "height"))
+        effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
+        yield Portion(x, y, height, effects)
+        first += len(x)
+
+
+# Of the areal density each way: a picture of it, in 70 kB.
+_MOST_BLOCKS = 64
+_NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
+
+
+def judge_form(
+    measured: MeasurementMeasuredPortions,
+    surface: Surface,
+    out: Path,
+    asked: Sequence[str],
+    aperture: Aperture | None = None,
+    filters: tuple[float | None, float | None] = (None, None),
+    tolerance: float | None = None,
+) -> dict[str, Any]:
+    """Register a measurement to its nominal ``surface``; return what ``form.json`` says of it.
+
+    Writes into ``out`` form.json, curves.json (profiles and power spectral densities) and
+    deviation.ply: deviation along the normal over the part's x and y.
+
+    asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
+    filters: wavelengths of the S- and the L-filter [m], None for what the points allow
+    tolerance: of the peak to valley of 99.5 % [m], if there is one
+
+    Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
+    """
+    form = measured.form(surface, asked, aperture, filters)
+    facts = form_facts(form, measured, surface)
+    if tolerance is not None:
+        found = conformity(form.deviation["robust_peak_to_valley"], tolerance)
+        facts["conformity"] = found.entry() if found else None
+    save_json(out / FORM, facts)
+    save_json(out / CURVES, _curves(form))
+    write_ply(out / DEVIATION, _deviations(form))
+    return facts
+
+
+def draw_form(measured: Path, out: Path) -> None:
+    """Write the page of a form that :func:`judge_form` has left in ``out``.
+
+    measured: what it is of; what a summary beside it says of the measurement is on the page
+    """
+    # Here, because drawing takes longer to load than many a form to judge.
+    from omsm_ros.pipelines.publish import publish_form
+
+    folder = measured if measured.is_dir() else measured.parent
+    beside = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
+    summary = read_summary(beside) if beside and beside.is_file() else None
+    publish_form(out, f"Form of {measured.resolve().name}", summary)
+
+
+def _deviations(form: Form) -> np.ndarray[Any, np.dtype[np.void]]:
+    table = np.empty(len(form.map), [(name, "<f8") for name in "xyz"])
+    table["x"], table["y"], table["z"] = form.map.x, form.map.y, form.map.deviation
+    return table
+
+
+def form_facts(
+    form: Form, measured: MeasurementMeasuredPortions, nominal: Surface
+) -> dict[str, Any]:
+    """Return the content of ``form.json``; lengths in metres, angles in radians."""
+    found = form.registration
+    placement = found.placement
+    return {
+        "pose": {
+            name: {"value": placement.value(name), "uncertainty": found.uncertainty(name)}
+            for name in FREEDOMS
+        },
+        "deviation": {name: figure.entry() for name, figure in form.deviation.items()},
+        "zernike": _terms(form),
+        "removed": {
+            "fitted": list(found.freedoms.fitted),
+            "not_determined": dict(found.freedoms.refused),
+            "held": dict(found.freedoms.held),
+            "pose_uncertainty": {
+                source: dict(zip(found.freedoms.fitted, map(float, shares), strict=True))
+                for source, shares in found.from_source.items()
+            },
+            "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
+            "notes": [
+                *measured.notes,
+                *_unlike(form, nominal),
+                *_advice(form),
+            ],
+        },
+        "aperture": {
+            "radius": form.aperture.radius,
+            "x": form.aperture.x,
+            "y": form.aperture.y,
+            "s_filter": form.bands.s_filter,
+            "l_filter": form.bands.l_filter,
+            "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},
+            "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",
+        },
+        "points": _counts(form, measured.missing),
+    }
+
+
+def _unlike(form: Form, nominal: Surface) -> list[str]:
+    x, y = form.map.x, form.map.y
+    return unlike(x, y, nominal.height(x, y) + form.map.deviation, nominal)
+
+
+def _counts(form: Form, missing: int) -> dict[str, int]:
+    """Return every point by what became of it, and those that never had a height."""
+    added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
+    return form.counts | added
+
+
+def _advice(form: Form) -> list[str]:
+    """Return what would say more, where a move leaves less of the form than it is sure of."""
+    freedoms, rms = form.registration.freedoms, form.deviation["rms"]
+    fitted = [n for n in freedoms.fitted if n in MOVES]
+    if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
+        fitted = []
+    advice = [
+        f"a move along {' and '.join(fitted)} looks like form here, and was fitted, so that little "
+        "is known of form that looks so; the figures of the best fit hold all the same; if the "
+        "part was not moved since it was cut, hold it: --fit piston,tip,tilt"
+    ] * bool(fitted)
+    if freedoms.held:
+        others = ",".join(n for n in freedoms.fitted if n not in freedoms.held)
+        advice.append(
+            f"{' and '.join(freedoms.held)} held as in the nominal pose, for form looks like a "
+            "move there; how far the part may be off all the same is in every uncertainty but "
+            "those of the best fit, which no move changes; if it "
+            f"is known to sit within a micrometre, name what to fit: --fit {others}"
+        )
+    return advice
+
+
+def _curves(form: Form) -> dict[str, Any]:
+    density = form.density
+    x, y, areal = density.coarse(_MOST_BLOCKS)
+    return {
+        "profiles": {name: curve.entry() for name, curve in form.profiles.items()},
+        "psd": {
+            "radial": density.radial.entry(),
+            "azimuthal": density.azimuthal.entry(),
+            "areal": {"x": x.tolist(), "y": y.tolist(), "value": areal.tolist()},
+            "mean_square": density.mean_square,
+            "band": list(density.band),
+            "mean_square_in_band": density.mean_square_in_band,
+            "normalisation": "two-sided areal density [m^4] over frequency [1/m], in blocks; its "
+            "sum times the area of a block, and the integral of that over direction [m^2/rad], are "
+            "mean_square [m^2]; the integral of 2 pi f times the radial one is that in the band",
+        },
+    }
+
+
+def _terms(form: Form) -> list[dict[str, Any]]:
+    fit = form.zernike
+    known = [
+        {"n": t.n, "m": t.m, "value": float(value), "uncertainty": float(spread)}
+        for t, value, spread in zip(fit.terms, fit.coefficients, fit.uncertainty, strict=True)
+    ]
+    return known + [{"n": t.n, "m": t.m, "value": None, "uncertainty": None} for t in fit.left_out]
+
+
+# A measurement in the frame of its part, registered to the nominal surface.
+
+_PORTION_REGISTERED_POINTS = 65_536
+POSE = "pose of the part"
+
+
+def registered(m: Measurement, nominal: Surface, freedoms: Sequence[str]) -> Measurement:
+    """Return the measurement's deviations along the normal, in the frame of its part.
+
+    Its errors are what they are once the pose has followed them, and the pose's own are one more
+    source; what lies far from the smooth form of the part, as dust, is left out and noted.
+
+    Raises DataError for points that do not fit the surface.
+    """
+    points, fields = m.points, m.fields
+    names = fields.names if fields is not None else ()
+
+    def portions() -> Iterator[Portion]:
+        for first in range(0, len(points), _PORTION_REGISTERED_POINTS):
+            part = slice(first, first + _PORTION_REGISTERED_POINTS)
+            x, y, height = points.x[part], points.y[part], points.height[part]
+            effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
+            yield Portion(x, y, height, effects)
+
+    found = register(nominal, portions, freedoms, sources=names, even=as_grid(points) is not None)
+    where = [placed(nominal, found.placement, portion) for portion in portions()]
+    whole = Placed(*(np.concatenate(parts, axis=-1) for parts in zip(*where, strict=True)))
+    kept = np.flatnonzero(np.isfinite(whole.deviation))
+    kept = kept[found.good(whole.part(kept))]
+    placed_points = whole.part(kept)
+    return replace(
+        m,
+        points=_points(points, placed_points, kept, found),
+        fields=None if fields is None else _Followed(found, placed_points, kept, fields),
+        pose=_OfPose(found, placed_points),
+    )
+
+
+def _points(
+    points: MeasuredPoints, at: Placed, kept: IntArray, found: Registration
+) -> MeasuredPoints:
+    note = "registered by " + ", ".join(
+        f"{name} {found.placement.value(name):.4g}" for name in found.freedoms.fitted
+    )
+    left_out = len(points) - len(kept)
+    return replace(
+        points.part(kept),
+        x=at.x,
+        y=at.y,
+        height=at.deviation,
+        notes=(*points.notes, note, *([f"{left_out} points left out"] if left_out else ())),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """Fields of a scan once the pose has followed each error, as ``omsm form`` has them."""
+
+    found: Registration
+    at_: Placed
+    kept: IntArray
+    fields: Fields
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.fields.names
+
+    def at(self, first: int, count: int) -> FloatArray:
+        """Return the fields (s, count) [m] of the kept points from ``first`` on."""
+        chosen = self.kept[first : first + count]
+        low = int(chosen[0]) if len(chosen) else 0
+        rows = self.fields.at(low, int(chosen[-1]) - low + 1 if len(chosen) else 0)
+        part = _slice(self.at_, first, count)
+        return self.found.effects(part, rows[:, chosen - low])[1][: len(rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class _OfPose:
+    """What the pose may be wrong by, one row an independent part of it."""
+
+    found: Registration
+    at_: Placed
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
+
+    def at(self, first: int, count: int) -> FloatArray:
+        """Return the fields (p, count) [m] of the kept points from ``first`` on."""
+        part = _slice(self.at_, first, count)
+        none = np.zeros((self.found.moved.shape[1] - 2 * len(self.found.held_effects), len(part.x)))
+        pose, sources = self.found.effects(part, none)
+        return np.concatenate([pose, sources[len(none) :]])
+
+
+def _slice(at: Placed, first: int, count: int) -> Placed:
+    return Placed(*(values[..., first : first + count] for values in at))

@@ -1,0 +1,338 @@
+"""A recording of another program, made into a bag."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.streams.imported_columns import (
+    AXES,
+    COUNTING,
+    MOST_PERIOD_ERROR,
+    PROBE,
+    ColumnMap,
+    Rows,
+    axis_blocks,
+    check_epoch,
+    counter_of_times,
+    counter_of_triggers,
+    distance_blocks,
+    in_step,
+    period_of,
+)
+from omsm_ros.errors import DataError, FileError
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import whole_bag
+from omsm_ros.io.tables.open_tables import open_tables
+from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.quantities import shown
+from omsm_ros.units import DATE
+
+# Which trigger number has each row of a foreign recording, and when was it taken?
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a stream's time and count begin.
+
+    start: instant [s, Unix] of ``epoch``, a time [s] of the recording;  zero: that of trigger 0
+    """
+
+    start: float = 0.0
+    epoch: float = 0.0
+    zero: float = 0.0
+
+
+class RowCounter:
+    """Counts the rows of a stream by their triggers, else by their time, else one by one."""
+
+    def __init__(self, stream: str, mapped: ColumnMap, timed: bool, triggered: bool) -> None:
+        """timed, triggered: which of both columns the ``stream``, a file or topic, has."""
+        if not timed and mapped.sample_period is None:
+            raise FileError(f"{stream} has no column of time; state sample_period in the map")
+        self._mapped, self._timed, self._triggered = mapped, timed, triggered
+        self._period = 0.0 if mapped.sample_period is None else mapped.sample_period
+        self._last: tuple[float, int] | None = None
+        self.origin = Origin(mapped.start)
+
+    def begin(self, first: Mapping[str, FloatArray]) -> tuple[float | None, float]:
+        """Take the period from the ``first`` rows; return the time of trigger 0, and it [s]."""
+        times = self._times(first)
+        if times is None:
+            return None, self._period
+        check_epoch(float(times[0]), self._mapped.columns["time"], self._mapped.start)
+        self._period = period_of(times, self._mapped.sample_period)
+        number = self._triggers(first)[0] if self._triggered else 0
+        return float(times[0]) - number * self._period, self._period
+
+    def count(self, piece: Mapping[str, FloatArray]) -> Rows:
+        """Return the numbers and times of the next rows (column name → (n,))."""
+        times, origin = self._times(piece), self.origin
+        number = -1 if self._last is None else self._last[1]
+        if self._triggered:
+            counter = counter_of_triggers(self._triggers(piece), number)
+        elif times is not None:
+            before = self._last or (origin.zero - self._period, -1)
+            counter = counter_of_times(times, self._period, before)
+        else:
+            counter = np.arange(number + 1, number + 1 + len(next(iter(piece.values()))))
+        elapsed = counter * self._period if times is None else times - origin.epoch
+        self._last = (0.0 if times is None else float(times[-1]), int(counter[-1]))
+        return Rows(counter, elapsed, self._period, origin.start)
+
+    def _times(self, piece: Mapping[str, FloatArray]) -> FloatArray | None:
+        if not self._timed:
+            return None
+        column = self._mapped.columns["time"]
+        return np.asarray(piece[column.name] * column.factor)
+
+    def _triggers(self, piece: Mapping[str, FloatArray]) -> FloatArray:
+        return piece[self._mapped.columns["trigger"].name]
+
+
+@dataclass(slots=True)
+class ImportedFile:
+    """What came out of one file, or of one topic of a bag.
+
+    missing: trigger numbers that it skips;  invalid: readings of the probe that are none
+    lost: rows where an axis is no number;  repeated_names: lines that repeat the line of names
+    passed_over: messages that hold none of the columns
+    own_clock: whether it shares no trigger with the others, only time
+    """
+
+    file: str
+    rows: int = 0
+    axes: bool = False
+    distance: bool = False
+    sample_period: float = 0.0
+    missing: int = 0
+    invalid: int = 0
+    lost: int = 0
+    repeated_names: int = 0
+    passed_over: int = 0
+    own_clock: bool = False
+
+
+def import_recording(
+    files: Sequence[Path],
+    mapped: ColumnMap,
+    written: TableForm,
+    out: Path,
+    progress: Progress = no_progress,
+) -> list[ImportedFile]:
+    """Write the bag ``out`` from ``files``; each has the axes, the probe, or both.
+
+    Files with the same columns continue each other; a file of axes and one of the probe lie
+    side by side, row by row, or by their columns of trigger numbers or time. Raises FileError and
+    DataError for what is missing or unclear; the bag then does not appear.
+    """
+    with ExitStack() as opened:
+        sources = []
+        for path in files:
+            for table in open_tables(path, written, mapped.names((*AXES, *PROBE))):
+                opened.callback(table.close)
+                sources.append(_Source(table, mapped))
+        _import(sources, mapped, out, progress)
+        return [source.found for source in sources]
+
+
+def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: Progress) -> None:
+    chains: dict[tuple[str, ...], list[_Source]] = {}
+    for source in sources:
+        chains.setdefault(source.channels, []).append(source)
+    _check_streams(sources, list(chains), mapped)
+    streams = [_Stream(chain, mapped) for chain in chains.values()]
+    _align(streams, mapped)
+    topics = [bags.AXES_TOPIC] * any(source.found.axes for source in sources)
+    topics += [bags.DISTANCE_TOPIC] * any(source.found.distance for source in sources)
+    done = 0
+    with whole_bag(out, topics) as bag:
+        # By time, as they would have been recorded, so that no reader has to keep one back.
+        merged = heapq.merge(*(s.blocks() for s in streams), key=lambda block: block.stamp_ns)
+        for block in merged:
+            if isinstance(block, AxisBlock):
+                bag.write_axes(block)
+            else:
+                bag.write_distance(block)
+            done += len(block)
+            progress(done, 0)
+        _check_counted(streams)
+
+
+def _check_streams(
+    sources: Sequence[_Source], chains: list[tuple[str, ...]], mapped: ColumnMap
+) -> None:
+    """Raise FileError unless each stream is whole and comes from files of one kind."""
+    for channel in mapped.columns:
+        if not mapped.has(channel):
+            continue
+        holders, name = [c for c in chains if channel in c], mapped.columns[channel].name
+        if not holders:
+            raise FileError("; ".join(source.without(name, channel) for source in sources))
+        if len(holders) > 1 and channel not in COUNTING:
+            raise FileError(
+                f"files with different columns have the column {name!r} of {channel}; import them "
+                "one by one, or leave out those that only repeat it"
+            )
+
+
+def _check_counted(streams: Sequence[_Stream]) -> None:
+    """Raise FileError where triggers are missing in one stream, and another cannot show it."""
+    gaps = [s for s in streams if any(source.found.missing for source in s.sources)]
+    uncounted = [s for s in streams if not s.counted]
+    if gaps and uncounted:
+        raise FileError(
+            f"{gaps[0].sources[0].found.file} lacks triggers, and "
+            f"{uncounted[0].sources[0].found.file} has no column that tells which rows belong to "
+            "the others; give it the trigger or the time, too"
+        )
+
+
+@contextmanager
+def _told_of(file: str) -> Iterator[None]:
+    """Name the file where its rows cannot be counted."""
+    try:
+        yield
+    except DataError as err:
+        raise DataError(f"{file}: {err}") from err
+
+
+class _Stream:
+    """Files of the same columns, one after the other, and the count of their rows."""
+
+    def __init__(self, sources: Sequence[_Source], mapped: ColumnMap) -> None:
+        self.sources = sources
+        channels = sources[0].channels
+        self.triggered = "trigger" in channels
+        self.counted = bool({*COUNTING} & {*channels})
+        self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
+        first = sources[0].first()
+        with _told_of(sources[0].found.file):
+            self.begins, self.period = self.counter.begin(first)
+
+    def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
+        """Yield the blocks of all files."""
+        for source in self.sources:
+            yield from source.blocks(self.counter)
+
+
+def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
+    """Begin the count of all streams together, where their times do not forbid it."""
+    begun = [s.begins for s in streams if s.begins is not None]
+    if not begun:
+        return
+    epoch = min(begun)
+    start = epoch if mapped.dated else mapped.start
+    counted = len(begun) < len(streams) or any(s.triggered for s in streams)
+    together = counted or in_step(begun, [s.period for s in streams])
+    for stream in streams:
+        own = stream.begins is not None and not together
+        stream.counter.origin = Origin(start, epoch, stream.begins if own else epoch)
+        for source in stream.sources:
+            source.found.own_clock = own
+
+
+class _Source:
+    """One table, and how far it was read."""
+
+    def __init__(self, table: ForeignTable, mapped: ColumnMap) -> None:
+        self._table, self._mapped = table, mapped
+        self._last: int | None = None
+        wanted = [c for c in (*AXES, *PROBE, *COUNTING) if mapped.has(c)]
+        self.channels = tuple(c for c in wanted if table.names.count(mapped.columns[c].name) == 1)
+        streams = {*self.channels} - {*COUNTING}
+        axes, probe = streams & {*AXES}, "distance" in streams
+        self.found = ImportedFile(table.label, axes=bool(axes), distance=probe)
+        lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
+        if lacking:
+            raise FileError(
+                f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together: "
+                "give them in one file"
+            )
+        table.used(mapped.names(self.channels))
+        self._check_units()
+        self._check_period()
+
+    def without(self, name: str, channel: str) -> str:
+        """Return why the column ``name`` of ``channel`` is not to be had here."""
+        if often := self._table.names.count(name):
+            return (
+                f"{self._table} has {often} columns {name!r}, one of which is {channel}; "
+                "rename the others"
+            )
+        return (
+            f"{self._table} has no column {name!r} of {channel}, but {shown(self._table.names)}; "
+            "name it as the file does"
+        )
+
+    def _check_period(self) -> None:
+        stated, mapped = self._table.sample_period, self._mapped.sample_period
+        if stated and mapped and abs(mapped / stated - 1) > MOST_PERIOD_ERROR:
+            raise FileError(
+                f"{self._table} states a sample period of {stated:g} s, the map {mapped:g} s; "
+                "correct the map"
+            )
+
+    def _check_units(self) -> None:
+        """Raise FileError where the map contradicts what the file itself says of a unit."""
+        for channel in self.channels:
+            column = self._mapped.columns[channel]
+            stated = stated_unit(self._table, column.name)
+            if column.contradicts(stated, channel):
+                raise FileError(
+                    f"{self._table} has {column.name!r} in {stated}, the map in {column.unit}; "
+                    f"correct the map, or, if the file is wrong, write unit: count and count: what "
+                    "one is in SI"
+                )
+
+    def first(self) -> Mapping[str, FloatArray]:
+        """Return the first rows; FileError where there are none."""
+        for piece in self._pieces():
+            return piece
+        raise FileError(f"{self._table} has no row of numbers; check that it was written")
+
+    def blocks(self, counter: RowCounter) -> Iterator[AxisBlock | DistanceBlock]:
+        """Yield the file's blocks; ``counter`` goes on from the file before."""
+        found = self.found
+        for piece in self._pieces():
+            with _told_of(found.file):
+                rows = counter.count(piece)
+            skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
+            self._last = int(rows.counter[-1])
+            found.missing += int(np.sum(skipped))
+            found.rows += len(rows.counter)
+            found.sample_period = rows.period
+            yield from self._made(piece, rows)
+        found.repeated_names = self._table.repeated_names
+        found.passed_over = self._table.passed_over
+
+    def _number(self, rows: Rows) -> int:
+        """Return the trigger number before those of ``rows``."""
+        return int(rows.counter[0]) - 1 if self._last is None else self._last
+
+    def _made(
+        self, piece: Mapping[str, FloatArray], rows: Rows
+    ) -> Iterator[AxisBlock | DistanceBlock]:
+        found = self.found
+        if found.axes:
+            for block in axis_blocks(piece, self._mapped, rows):
+                finite = [np.isfinite(v) for v in (block.x, block.y, block.z, block.b, block.c)]
+                found.lost += int(np.sum(~np.all(finite, axis=0)))
+                yield block
+        if found.distance:
+            for reading in distance_blocks(piece, self._mapped, rows):
+                found.invalid += int(np.sum(~reading.ok))
+                yield reading
+
+    def _pieces(self) -> Iterator[dict[str, FloatArray]]:
+        names = list(dict.fromkeys(self._mapped.names(self.channels)))
+        time = self._mapped.columns.get("time")
+        dates = [n for n in names if time is not None and time.unit == DATE and n == time.name]
+        return self._table.pieces(names, dates)

@@ -1,0 +1,399 @@
+"""A finished measurement: its cloud, its summary and its page in one folder."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from omsm_ros import __version__
+from omsm_ros.core.calibration.calibration import Calibration, age_at, beyond_lag, latency_of
+from omsm_ros.core.calibration.calibration_set import CalibrationSet
+from omsm_ros.core.correction.budget import (
+    Light,
+    Reason,
+    ScanBudget,
+    light_of,
+    noisier,
+    scan_budget,
+)
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, RANDOM, MachineSources
+from omsm_ros.core.correction.predict import predict_error
+from omsm_ros.core.correction.systematic import resolves_turns, scan_fields
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.lti.discretisation import discretisation_error, discretise
+from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.deviation import unlike
+from omsm_ros.errors import DataError
+from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
+from omsm_ros.io.results import save_fields
+from omsm_ros.io.topics import AnyBag
+from omsm_ros.pipelines.correct import Admission, ByStamps, Correction, correct_bag
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.quantities import TEMPERATURE
+
+if TYPE_CHECKING:
+    from omsm_ros.pipelines.correct import Correction
+
+
+# What is the uncertainty of a corrected scan made of, and may it be relied on?
+
+# What a fit takes out of the deviations is no error of theirs any more; how well it does is in
+# the uncertainty of the form.
+_POSE_FREEDOMS: Mapping[str, tuple[str, ...]] = {
+    "tilt": ("tip", "tilt"),
+    "decentre": ("x", "y"),
+    "clocking": ("clocking",),
+}
+# A map with more holes than this hides something.
+_LEAST_SHARE_CORRECTED = 0.95
+
+
+def with_sources(
+    options: CorrectionOptions,
+    calibration: Calibration,
+    stated: MachineSources,
+    nominal: Surface | None,
+) -> CorrectionOptions:
+    """Return ``options`` with what is ``stated`` of the machine and the slopes of ``nominal``."""
+    known = options.sources or ErrorSources.of(calibration)
+    return replace(
+        options,
+        sources=replace(known, **stated.of_points()),
+        systematic=stated.of_the_scan(),
+        surface=nominal,
+    )
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a scan is judged by.
+
+    options: it was corrected with;  stated: of the machine;  accuracy: asked for, k = 2 [m]
+    out: folder for the fields of its systematic errors, None to keep none
+    fitted: freedoms of the pose that are fitted to the nominal surface, or "auto"
+    """
+
+    options: CorrectionOptions
+    stated: MachineSources = NOTHING_STATED
+    accuracy: float | None = None
+    out: Path | None = None
+    fitted: Sequence[str] = ()
+
+    def of(
+        self, done: Correction, calibration: Calibration, discretisation: float
+    ) -> dict[str, Any]:
+        """Return ``budget`` and ``light`` for ``summary.json``.
+
+        discretisation: rms of the digital filter's error on the scan's path [m]
+        """
+        options = self.options
+        trace = done.trace.points()
+        budget = scan_budget(
+            calibration,
+            options.sources or ErrorSources.of(calibration),
+            {"discretisation": discretisation}
+            | {n: size for n, size in done.budget.items() if size or n == SCAN_SCATTER},
+            options.geometry,
+            self.stated,
+            trace.with_slopes(options.surface) if len(trace) else trace,
+            done.trace.seen,
+        )
+        if self.out is not None and len(trace) and resolves_turns(trace):
+            kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
+            save_fields(self.out / SYSTEMATIC, kept)
+        return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
+
+    def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:
+        counts = _POSE_FREEDOMS if self.options.surface is not None else {}
+        fitted = [
+            name
+            for name, freedoms in _POSE_FREEDOMS.items()
+            if "auto" in self.fitted or set(freedoms) <= set(self.fitted)
+        ]
+        return light_of(
+            calibration,
+            {name: size for name, size in budget.heights.items() if name not in fitted},
+            self.stated,
+            accuracy=self.accuracy,
+            pose_open=[name for name in counts if name not in fitted],
+            registered=bool(fitted),
+            doubts=tuple(_losses(done)),
+        )
+
+
+def live_light(
+    corrector: Corrector,
+    calibration: Calibration,
+    stated: MachineSources,
+    accuracy: float | None,
+) -> Light:
+    """Return the light of what has been corrected so far, by the uncertainty of its points."""
+    shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
+    return light_of(
+        calibration,
+        shared,
+        stated,
+        accuracy=accuracy,
+        pose_open=(),
+        doubts=(*noisier(corrector.budget), *_without_slopes(corrector, stated)),
+    )
+
+
+def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[Reason]:
+    lateral = {s.name for s in stated.of_the_scan() if s.needs_slope and s.standard_uncertainty}
+    missing = sorted(lateral - set(corrector.budget))
+    if missing and corrector.trace.seen:
+        yield Reason(
+            f"{', '.join(missing)} not in the uncertainty of the points: no slopes are known",
+            "give the corrector the part's surface (parameter nominal)",
+        )
+
+
+def _losses(done: Correction) -> Iterator[Reason]:
+    yield from map(Reason, done.faults)
+    yield from noisier(done.budget)
+    for text in done.reasons:
+        yield Reason(
+            f"the calibration was used although {text}",
+            "identify as the scan is made, and correct with that calibration",
+        )
+    if beyond := done.account["axes"]["counted"].get("beyond"):
+        yield Reason(
+            f"{beyond} samples lie beyond the range of the calibration set",
+            "calibrate there too, and make the set anew with 'omsm calset'",
+        )
+    for name, stream in done.account.items():
+        lost = stream["received"] - stream["corrected"]
+        if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
+            share = 100 * lost / stream["received"]
+            yield Reason(
+                f"{name}: {lost} samples ({share:.1f} %) gave no point",
+                "see the reasons of the account; run slower where the probe lost its target",
+            )
+
+
+@dataclass(frozen=True)
+class Registering:
+    """How a part is registered to its nominal surface, and judged.
+
+    freedoms: of the fit, or "auto";  aperture: of the part, None for all points
+    tolerance: of the peak to valley of 99.5 % [m], if there is one
+    """
+
+    freedoms: Sequence[str]
+    aperture: Aperture | None = None
+    tolerance: float | None = None
+
+
+def measure(
+    bag: AnyBag,
+    calibration: Calibration,
+    out: Path,
+    *,
+    nominal: Surface | None = None,
+    options: CorrectionOptions | None = None,
+    admission: Admission | None = None,
+    lateral: float = 0.0,
+    by_stamps: ByStamps | None = None,
+    stated: MachineSources = NOTHING_STATED,
+    accuracy: float | None = None,
+    register: Registering | None = None,
+    report: bool = True,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
+
+    Beside them systematic.npz, what the systematic errors do to the points, for ``omsm form``.
+
+    lateral: lateral standard uncertainty of a point [m]; needs ``nominal`` for the slope
+    by_stamps: see :func:`omsm_ros.pipelines.correct.correct_bag`
+    stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
+    register: how the points are registered to ``nominal``; None: they are not
+    report: False writes no page, which takes longer than everything else
+
+    Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
+    """
+    used = with_sources(options or CorrectionOptions(), calibration, stated, nominal)
+    done = correct_bag(
+        bag,
+        calibration,
+        out / CLOUD,
+        options=used,
+        admission=admission,
+        nominal=nominal,
+        lateral=lateral,
+        by_stamps=by_stamps,
+        progress=progress,
+    )
+    fitted = register.freedoms if register is not None else ()
+    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out, fitted))
+    if register is not None and nominal is not None and done.statistics:
+        add_form(out, summary, nominal, register)
+    if report:
+        summary["files"]["report"] = REPORT
+    save_json(out / SUMMARY, summary)
+    if report:
+        _publish(bag, out, done, summary, calibration, nominal)
+    return summary
+
+
+def _unlike(done: Correction, nominal: Surface | None) -> list[str]:
+    if nominal is None:
+        return []
+    x, y = (done.points[name].astype(np.float64) for name in "xy")
+    return unlike(x, y, done.points["height"], nominal)
+
+
+def _publish(
+    bag: Path,
+    out: Path,
+    done: Correction,
+    summary: dict[str, Any],
+    calibration: Calibration,
+    nominal: Surface | None,
+) -> None:
+    # Here, because drawing takes longer to load than a scan to correct.
+    from omsm_ros.pipelines.publish import figures_of, map_of, publish, view_of
+
+    view = view_of(done.points, done.sample_period)
+    figures = figures_of(view, calibration, nominal, done.sample_period)
+    surface = map_of(view, nominal, out)
+    publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
+
+
+def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Registering) -> None:
+    """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
+    # Here, because most corrections do without.
+    from omsm_ros.pipelines.form import judge_form, open_measurement
+
+    facts = judge_form(
+        open_measurement(out),
+        nominal,
+        out,
+        register.freedoms,
+        register.aperture,
+        tolerance=register.tolerance,
+    )
+    summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
+    summary["files"] |= {"form": FORM, "deviation": DEVIATION}
+    if register.tolerance is not None:
+        summary["form"]["conformity"] = facts["conformity"]
+
+
+def summarise(
+    bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
+) -> dict[str, Any]:
+    """Return what ``summary.json`` says of every measurement; lengths in metres."""
+    summary: dict[str, Any] = {
+        "schema": "omsm-summary/1",
+        "bag": str(bag),
+        "calibration": calibration.id,
+        **_places(calibration),
+        "samples": done.account,
+        "uncertainty_budget": done.budget,
+        "sample_period": done.sample_period,
+        "stamp_skew": done.stamp_skew,
+        "conditions": conditions(done, calibration),
+        "settings": dict(calibration.settings),
+        "latency": latency_of(calibration).entry(),
+        "versions": {
+            "omsm_ros": __version__,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
+        },
+        "files": {"cloud": CLOUD, "summary": SUMMARY},
+        "admission": done.admission,
+        "warnings": [
+            *(f"overridden: {reason}" for reason in done.reasons),
+            *_implausible(done.temperatures),
+        ],
+    }
+    if not done.statistics:
+        summary["warnings"] += [*done.faults, "not one sample could be corrected; see the reasons"]
+        return summary
+    judged = _motion_judged(done, calibration)
+    summary["warnings"] += judged.pop("warnings")
+    summary["warnings"] += _unlike(done, judgement.options.surface)
+    if (late := beyond_lag(calibration, judgement.options.lateral_lag or 0.0)) is not None:
+        summary["warnings"].append(late)
+    of_filter = judged.get("discretisation", {}).get("rms", 0.0)
+    return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
+
+
+def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
+    """Return when a scan was made, how old its calibration was then [s], and how warm it was [°C].
+
+    Each is None where nobody recorded it.
+    """
+    told = done.temperatures[np.isfinite(done.temperatures)]
+    return {
+        "recorded_ns": done.recorded_ns,
+        "calibration_age": age_at(calibration, done.recorded_ns),
+        "temperature": None
+        if not len(told)
+        else {
+            "mean": float(np.mean(told)),
+            "lowest": float(np.min(told)),
+            "highest": float(np.max(told)),
+            "change": float(told[-1] - told[0]),
+        },
+    }
+
+
+def _implausible(temperatures: FloatArray) -> list[str]:
+    lost = int(np.sum(~np.isfinite(temperatures)))
+    said = (
+        f"{lost} of {len(temperatures)} temperatures cannot be, expected "
+        f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
+    )
+    return [said] * bool(lost)
+
+
+def _places(calibration: Calibration) -> dict[str, Any]:
+    """Return where the members of a calibration set were made."""
+    if not isinstance(calibration, CalibrationSet):
+        return {}
+    places = {"along": calibration.along, "positions": list(calibration.positions)}
+    return {"calibration_set": places}
+
+
+def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:
+    """Return whether the scan was slow enough to be trusted, and how good H was on its motion."""
+    try:
+        prediction = predict_error(calibration, done.path)
+        digital = discretise(calibration.dynamics, done.sample_period)
+        rms, spread = discretisation_error(
+            calibration.dynamics, digital, done.path.z, calibration.valid_up_to
+        )
+    except DataError as err:
+        return {"warnings": [f"the motion could not be judged: {err}"]}
+    return {
+        "warnings": [] if prediction.safe else [prediction.message],
+        "prediction": asdict(prediction),
+        "discretisation": {"rms": rms, "peak_to_valley": spread},
+    }
+
+
+def _figures_of_merit(done: Correction) -> dict[str, Any]:
+    removed = done.statistics["error"]
+    found: dict[str, Any] = {
+        "dynamic_error_before": {
+            "peak_to_valley": removed.peak_to_valley,
+            "rms": removed.rms_area_weighted,
+        },
+        "uncertainty": {
+            "median": float(np.median(done.points["uncertainty"])),
+            "largest": done.largest_uncertainty,
+        },
+    }
+    deviations = {n: asdict(s) for n, s in done.statistics.items() if n != "error"}
+    return found | ({"deviation": deviations} if deviations else {})

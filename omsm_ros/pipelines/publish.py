@@ -1,0 +1,224 @@
+"""The page of a finished measurement, or of a part that was registered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.surface.deviation import RunningStatistics, deviation
+from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.io.files import (
+    CLOUD,
+    CURVES,
+    DEVIATION,
+    FORM,
+    REPORT,
+    SPECTRUM,
+    SUMMARY,
+    save_json,
+    save_text,
+)
+from omsm_ros.io.folders import result_folder
+from omsm_ros.io.maps.read_map import read_points
+from omsm_ros.io.results import CloudFile, PlyWriter, read_curves, read_form, read_summary
+from omsm_ros.io.topics import AnyBag
+from omsm_ros.pipelines.correct import MOST_DRAWN
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.spectrum import (
+    SpectrumOfScan,
+    SpectrumOptions,
+    spectra_of,
+    summary_of,
+    without_bands,
+)
+from omsm_ros.readable import moment, quantity
+from omsm_ros.report import style
+from omsm_ros.report.measurement.figures import levelled, surface_figures
+from omsm_ros.report.measurement.form_figures import form_figures
+from omsm_ros.report.measurement.page import Report, render
+from omsm_ros.report.measurement.surface_map import CloudView, EmbeddedMap, Layer, embedded
+from omsm_ros.report.response_figures import bode
+
+
+def figures_of(
+    view: CloudView | None,
+    calibration: Calibration,
+    nominal: Surface | None,
+    sample_period: float,
+) -> dict[str, bytes]:
+    """Return PNG files for the page of a cloud whose truth nobody knows."""
+    figures = surface_figures(view, nominal) if view is not None else {}
+    return figures | {"bode": style.png(bode(calibration, None, sample_period))}
+
+
+def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
+    """Return the columns of a cloud for the figures; None if it has no points.
+
+    Without the dynamic correction its height would be ``raw_height``.
+    """
+    if not len(cloud):
+        return None
+    sample = cloud["sample"].astype(np.int64)
+    error = cloud["dynamic_error"].astype(np.float64)
+    return CloudView(
+        time=(sample - sample[0]) * sample_period,
+        x=cloud["x"].astype(np.float64),
+        y=cloud["y"].astype(np.float64),
+        height=cloud["height"].astype(np.float64),
+        raw_height=cloud["height"] + error,
+        dynamic_error=error,
+        uncertainty=cloud["uncertainty"].astype(np.float64),
+    )
+
+
+def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
+    """Return the map that a reader can enlarge; of the registered deviation if ``out`` has one."""
+    if view is None:
+        return None
+    layers = []
+    if (out / DEVIATION).is_file():
+        part = read_points(out / DEVIATION)
+        layers.append(Layer("registered deviation", part.x, part.y, part.height, "nm"))
+    if nominal is None:
+        height = view.height - view.height.min()
+        layers.append(Layer("height", view.x, view.y, height, "µm", symmetric=False))
+    else:
+        heights = {"corrected": (view.height, "nm"), "uncorrected": (view.raw_height, "µm")}
+        for name, (height, unit) in heights.items():
+            level = levelled(view, height, nominal)
+            layers.append(Layer(f"{name}, piston removed", view.x, view.y, level, unit))
+    spread = Layer("uncertainty, k = 1", view.x, view.y, view.uncertainty, "nm", symmetric=False)
+    return embedded([*layers, spread])
+
+
+def publish(
+    out: Path,
+    title: str,
+    summary: Mapping[str, Any],
+    calibration: Calibration | None,
+    figures: Mapping[str, bytes],
+    surface: EmbeddedMap | None = None,
+) -> None:
+    """Write ``report.html`` into ``out``; with what ``form.json`` there says of the part.
+
+    surface: map that a reader can enlarge
+    """
+    form = read_form(out / FORM) if (out / FORM).is_file() else {}
+    curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
+    if form:
+        figures = {**figures, **form_figures(form, curves)}
+    date = moment(datetime.now(timezone.utc))
+    page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
+    save_text(out / REPORT, page)
+
+
+def publish_form(out: Path, title: str, summary: Mapping[str, Any] | None = None) -> None:
+    """Write ``report.html`` of a registered part, from what was written of it into ``out``.
+
+    summary: of the measurement that its points are of, if there is one
+    """
+    part = read_points(out / DEVIATION)
+    layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
+    publish(out, title, summary or {}, None, {}, embedded([layer]))
+
+
+# The folder of ``omsm spectrum``: JSON, page, and the clouds without a stopped band.
+
+
+def publish_spectra(
+    paths: Sequence[AnyBag],
+    options: SpectrumOptions,
+    out: Path,
+    *,
+    report: bool = True,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Study the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
+    clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))]
+    with result_folder(out, (*clouds, *_clouds_before(out), REPORT, SPECTRUM)) as folder:
+        scans = spectra_of(paths, options, progress)
+        summary = summary_of(scans, options)
+        files = {"spectrum": SPECTRUM}
+        for name, scan in zip(clouds, scans, strict=True) if options.stop else ():
+            _write_cloud(folder / name, scan)
+            files[f"{scan.studied.signal.name} without the band"] = name
+        if report:
+            # Here, because drawing takes longer to load than all else.
+            from omsm_ros.report.spectrum import SpectrumPage, drawn, render
+
+            valid = options.calibration.valid_up_to if options.calibration else None
+            figures = drawn([(s.studied, s.named, s.motion) for s in scans], valid)
+            save_text(folder / REPORT, render(SpectrumPage(summary, figures)))
+            files["report"] = REPORT
+        summary["files"] = files
+        save_json(folder / SPECTRUM, summary)
+    return summary
+
+
+def _clouds_before(out: Path) -> list[str]:
+    """Return the clouds of an earlier run, which may have had more scans."""
+    earlier = out.glob("band_stopped_*.ply") if (out / SPECTRUM).is_file() else ()
+    return [path.name for path in earlier]
+
+
+def _write_cloud(path: Path, scan: SpectrumOfScan) -> None:
+    with PlyWriter(path, "omsm_ros, metres, a band of frequencies taken out") as ply:
+        ply.write(without_bands(scan))
+
+
+# The page of a measurement that was corrected earlier, drawn from what lies in its folder.
+
+# What points evenly chosen, of a longer cloud, may say differently of all.
+_SAME_RMS = 0.05
+
+
+def report_again(result: Path, calibration: Calibration, nominal: Surface | None = None) -> Path:
+    """Write ``report.html`` into the folder ``result`` of ``omsm correct``; return its path.
+
+    Nothing is computed anew: every figure comes from the summary there, every map from its cloud.
+    Raises FileError for a folder that holds no measurement, CalibrationError for another
+    calibration than the one it was corrected with, ConfigurationError where it had a nominal
+    surface and none is given, or another one.
+    """
+    summary = read_summary(result / SUMMARY)
+    used = summary.get("calibration")
+    if used != calibration.id:
+        raise CalibrationError(
+            f"{str(result)!r} was corrected with calibration {str(used)[:12]!r}, given is "
+            f"{calibration.id[:12]!r}; give the one that it was corrected with"
+        )
+    if nominal is None and "deviation" in summary:
+        raise ConfigurationError(
+            f"{str(result)!r} was corrected with a nominal surface, from which its figures "
+            "deviate; give it (--nominal)"
+        )
+    # Another than the calibration's where that was overridden; older summaries do not say it.
+    period = summary.get("sample_period", calibration.sample_period)
+    view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), period)
+    if nominal is not None and "deviation" in summary:
+        _check_nominal(view, nominal, summary["deviation"]["corrected"]["rms"])
+    figures = figures_of(view, calibration, nominal, period)
+    title = f"Surface of {Path(str(summary.get('bag', result))).name}"
+    publish(result, title, summary, calibration, figures, map_of(view, nominal, result))
+    return result / REPORT
+
+
+def _check_nominal(view: CloudView | None, nominal: Surface, rms: float) -> None:
+    """Raise ConfigurationError where the cloud does not deviate from ``nominal`` by ``rms`` [m]."""
+    if view is None:
+        return
+    found = RunningStatistics()
+    found.add(view.x, view.y, deviation(view.x, view.y, view.height, nominal))
+    here = found.statistics().rms
+    if abs(here - rms) > _SAME_RMS * max(here, rms):
+        raise ConfigurationError(
+            f"the cloud deviates from this nominal surface by {quantity(here, 'm')} rms, by "
+            f"{quantity(rms, 'm')} from the one that it was corrected with; give that one"
+        )

@@ -1,0 +1,114 @@
+"""Bags of the digital twin: a step test and a scan, to learn on and to try things out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from omsm_ros.core.streams.blocks import AccelerationBlock
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.files import save_text
+from omsm_ros.readable import count, quantity
+from omsm_ros.twin.cell import Recording, blocks_of
+from omsm_ros.twin.disturbances import NOTHING
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.units import NANOSECONDS_PER_S
+
+# A recording of the twin as a bag, as if its devices had been recorded.
+
+_BLOCK_SAMPLES = 1000
+
+
+def write_recording(path: Path, recording: Recording) -> Path:
+    """Write ``recording`` to the bag ``path``, and return it."""
+    topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
+    topics += [bags.ACCELERATION_TOPIC] if recording.acceleration is not None else []
+    with BagWriter(path, topics) as bag:
+        for axes, distance in blocks_of(recording, _BLOCK_SAMPLES):
+            bag.write_axes(axes)
+            bag.write_distance(distance)
+        if recording.acceleration is not None:
+            for block in acceleration_blocks(recording.acceleration, _BLOCK_SAMPLES):
+                bag.write_acceleration(block)
+    return path
+
+
+def acceleration_blocks(whole: AccelerationBlock, size: int) -> Iterator[AccelerationBlock]:
+    """Cut ``whole`` into blocks of ``size`` samples, as a driver publishes them."""
+    for start in range(0, len(whole), size):
+        part = slice(start, start + size)
+        yield AccelerationBlock(
+            stamp_ns=whole.stamp_ns + round(start * whole.sample_period * NANOSECONDS_PER_S),
+            first_sample=whole.first_sample + start,
+            sample_period=whole.sample_period,
+            x=whole.x[part],
+            y=whole.y[part],
+            z=whole.z[part],
+        )
+
+
+# Half a gigabyte of memory, a whole with everything that may be wrong with a machine.
+_MOST_SAMPLES = 1_000_000
+STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class TwinBags:
+    """Where the recordings lie, and how many samples each has."""
+
+    steps: str
+    scan: str
+    nominal: str
+    step_samples: int
+    scan_samples: int
+
+
+def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = None) -> TwinBags:
+    """Write ``steps.mcap``, ``scan.mcap`` and the nominal ``mirror.yaml`` into ``out``.
+
+    Raises BagError where a bag of that name is there already, ConfigurationError for a scan beyond
+    the mirror or longer than memory holds.
+    """
+    _check(scenario)
+    wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
+    steps = _write(out / STEPS, planned_test_of(scenario, wrong))
+    scan = _write(out / SCAN, scan_of(scenario, wrong))
+    write_nominal(out / NOMINAL)
+    return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+
+
+def _check(scenario: Scenario) -> None:
+    if scenario.start_radius > PAPER_MIRROR_RADIUS_M:
+        raise ConfigurationError(
+            f"a radius of {quantity(scenario.start_radius, 'm')} is beyond the twin's mirror, "
+            f"which ends at {quantity(PAPER_MIRROR_RADIUS_M, 'm')}; give it in metres"
+        )
+    samples = spiral_of(scenario).duration / scenario.sample_period
+    if samples > _MOST_SAMPLES:
+        raise ConfigurationError(
+            f"a scan of {count(round(samples))} samples, expected {count(_MOST_SAMPLES)} at most; "
+            "take a wider feed, a smaller radius or a faster spindle"
+        )
+
+
+def write_nominal(path: Path) -> None:
+    """Write what the twin's mirror should be."""
+    nominal = {
+        "shape": "off_axis_paraboloid",
+        "parent_focal_length": PAPER_MIRROR.parent_focal_length,
+        "off_axis_distance": PAPER_MIRROR.off_axis_distance,
+    }
+    save_text(path, yaml.safe_dump(nominal, sort_keys=False))
+
+
+def _write(path: Path, recording: Recording) -> int:
+    """Write a recording as a bag; return its samples."""
+    write_recording(path, recording)
+    return len(recording.axes)

@@ -1,0 +1,287 @@
+"""The page of a campaign: what stands out, what drifts, and every measurement in a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.trend import FEWEST, Trend, outliers, trend
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.readable import NOTHING, count, days, moment_of, percent, quantity
+from omsm_ros.report import style
+from omsm_ros.report.page_parts import fill, picture
+from omsm_ros.report.tables import part
+from omsm_ros.report.verdict import verdict_on_measurement
+from omsm_ros.units import DAY_S, MICROSECOND_S, NANOMETRE_M, NANOSECONDS_PER_S
+
+# What three digits do not show is no finding, however regular it is.
+_ALIKE = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A number that each measurement has.
+
+    place: where its summary holds it;  unit: of it;  judged: whether it may stand out and drift
+    """
+
+    name: str
+    place: tuple[str, ...]
+    unit: str = "m"
+    judged: bool = True
+
+    @property
+    def drawn(self) -> tuple[float, str]:
+        """What one unit on the picture is in the unit of the summary, and its name."""
+        return {"m": (NANOMETRE_M, "nm"), "s": (DAY_S, "d")}.get(self.unit, (1.0, self.unit))
+
+    def told(self, value: float) -> str:
+        """Return a value as text."""
+        return days(value) if self.unit == "s" else quantity(value, self.unit)
+
+
+TEMPERATURE = Series("Temperature", ("conditions", "temperature", "mean"), "°C")
+SERIES = (
+    Series("Deviation from nominal, rms by area", ("deviation", "corrected", "rms_area_weighted")),
+    Series("Deviation, peak to valley", ("deviation", "corrected", "peak_to_valley")),
+    Series("Dynamic error removed, rms", ("dynamic_error_before", "rms")),
+    Series("Standard uncertainty, median", ("uncertainty", "median")),
+    Series("Scatter beyond what is stated, rms", ("uncertainty_budget", "scan_scatter")),
+    TEMPERATURE,
+    # It grows by a day a day.
+    Series("Age of the calibration", ("conditions", "calibration_age"), "s", judged=False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One bag of a campaign: its name, state, time [ns], link, and what its summary says.
+
+    said: why there is no summary, if there is none
+    """
+
+    name: str
+    state: str
+    said: str
+    recorded_ns: int | None
+    link: str
+    summary: Mapping[str, Any]
+
+
+def render(title: str, measurements: Sequence[Measurement], calibration: Calibration) -> str:
+    """Return the page as HTML; all text from outside is escaped."""
+    judged = judge(measurements)
+    return fill(
+        "campaign.html",
+        title=title,
+        headlines=_headlines(measurements),
+        remarks=remarks(measurements, judged),
+        figure=picture(_figure(measurements, judged)) if judged else "",
+        names=[series.name for series in SERIES],
+        rows=[_row(i, m, judged, calibration) for i, m in enumerate(measurements)],
+        calibration=calibration.id,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A series over all measurements: values (n,), which stand out (n,), how it drifts."""
+
+    series: Series
+    values: FloatArray
+    outlying: Any
+    drift: Trend | None
+
+
+def judge(measurements: Sequence[Measurement]) -> list[Judged]:
+    """Look for outliers and drift in each series that any measurement has."""
+    times = _times(measurements)
+    found = []
+    for series in SERIES:
+        values = np.array([_value(m, series) for m in measurements])
+        if np.any(np.isfinite(values)):
+            drift = trend(times, values) if series.judged else None
+            outlying = outliers(values) & _differs(values, np.nanmedian(values)) & series.judged
+            found.append(Judged(series, values, outlying, _seen(drift, times, values)))
+    return found
+
+
+def _differs(values: FloatArray, usual: float) -> BoolArray:
+    """Return where values (n,) read otherwise than the usual one, at three digits."""
+    return np.asarray(np.abs(values - usual) > _ALIKE * abs(usual))
+
+
+def _seen(slope: Trend | None, over: FloatArray, values: FloatArray) -> Trend | None:
+    """Return a trend whose change over all measurements could be read, None for any other."""
+    if slope is None:
+        return None
+    change = slope.slope * np.ptp(over[np.isfinite(over)])
+    return slope if abs(change) > _ALIKE * abs(np.nanmedian(values)) else None
+
+
+def remarks(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> list[str]:
+    """Say what failed, what stands out and what drifts, each in a sentence."""
+    found = [f"{m.name}: {m.state}, {m.said}" for m in measurements if m.state != "done"]
+    for one in judged:
+        for i in np.flatnonzero(one.outlying):
+            usual = one.series.told(float(np.nanmedian(one.values)))
+            value = one.series.told(float(one.values[i]))
+            found.append(
+                f"{measurements[i].name} stands out: {_low(one.series.name)} is {value}, where "
+                f"{usual} is usual"
+            )
+        if one.drift is not None and one.drift.significant:
+            unit = "K" if one.series is TEMPERATURE else one.series.unit
+            low, high = (quantity(s * DAY_S, unit) for s in (one.drift.low, one.drift.high))
+            found.append(f"{one.series.name} drifts by {low} to {high} a day (95 %)")
+    found += _with_temperature(judged)
+    if sum(m.state == "done" for m in measurements) < FEWEST:
+        found.append(f"outliers and drift: not evaluated, of fewer than {FEWEST} measurements")
+    return found
+
+
+def _with_temperature(judged: Sequence[Judged]) -> list[str]:
+    """Say which figures go with the temperature, each in a sentence."""
+    warm = [one.values for one in judged if one.series is TEMPERATURE]
+    found = []
+    for one in judged:
+        if not warm or one.series is TEMPERATURE or not one.series.judged:
+            continue
+        slope = _seen(trend(warm[0], one.values), warm[0], one.values)
+        if slope is not None and slope.significant:
+            low, high = (quantity(s, one.series.unit) for s in (slope.low, slope.high))
+            found.append(
+                f"{one.series.name} goes with the temperature, {low} to {high} a kelvin (95 %)"
+            )
+    return found
+
+
+def _low(name: str) -> str:
+    return name[0].lower() + name[1:]
+
+
+def _value(measurement: Measurement, series: Series) -> float:
+    value = part(measurement.summary, *series.place)
+    return float(value) if isinstance(value, int | float) else np.nan
+
+
+def _times(measurements: Sequence[Measurement]) -> FloatArray:
+    """Return the time of each recording [s], NaN where it has none."""
+    unknown = np.nan
+    return np.array(
+        [
+            unknown if m.recorded_ns is None else m.recorded_ns / NANOSECONDS_PER_S
+            for m in measurements
+        ]
+    )
+
+
+def _headlines(measurements: Sequence[Measurement]) -> list[tuple[str, str]]:
+    states = [m.state for m in measurements]
+    return [(state, count(states.count(state))) for state in ("done", "refused", "crashed")]
+
+
+def _row(
+    place: int, measurement: Measurement, judged: Sequence[Judged], calibration: Calibration
+) -> dict[str, Any]:
+    known = {one.series: one for one in judged}
+    cells = []
+    for series in SERIES:
+        one = known.get(series)
+        text = NOTHING if one is None else series.told(float(one.values[place]))
+        cells.append((text, one is not None and bool(one.outlying[place])))
+    verdict = None
+    if measurement.state == "done":
+        verdict = verdict_on_measurement(measurement.summary, calibration)
+    stream = part(measurement.summary, "samples", "distance") or {}
+    received, corrected = stream.get("received", 0), stream.get("corrected", 0)
+    return {
+        "name": measurement.name,
+        "link": measurement.link,
+        "when": moment_of(measurement.recorded_ns),
+        "verdict": verdict,
+        "said": measurement.said,
+        "state": measurement.state,
+        "points": count(corrected) if received else NOTHING,
+        "left_out": percent(1 - corrected / received) if received else NOTHING,
+        "cells": cells,
+    }
+
+
+def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> bytes:
+    """Return each series over time, or over the order of names where no time is known."""
+    times = _times(measurements)
+    timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
+    x = (times - np.nanmin(times)) / DAY_S if timed else np.arange(len(measurements))
+    made, axes = style.figure(10.0, 2.1 * len(judged) + 0.5, rows=len(judged), sharex=True)
+    for one, panel in zip(judged, axes[:, 0], strict=True):
+        usual = ~one.outlying
+        per_unit, unit = one.series.drawn
+        values = one.values / per_unit
+        panel.plot(x[usual], values[usual], ".", color=style.AFTER, markersize=5)
+        panel.plot(x[one.outlying], values[one.outlying], "o", color=style.BEFORE)
+        if one.series is not TEMPERATURE:
+            # A twentieth more than the largest, so that its dot is whole.
+            panel.set_ylim(
+                min(0.0, float(np.nanmin(values))), 1.05 * (float(np.nanmax(values)) or 1.0)
+            )
+        if not timed:
+            panel.xaxis.get_major_locator().set_params(integer=True)
+        style.label(panel, y=unit, title=one.series.name)
+    style.label(axes[-1, 0], x="days since the first recording" if timed else "measurement")
+    return style.png(made, dpi=120)
+
+
+# Lag, static gain and form of each machine over months.
+
+_COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+class History(Protocol):
+    """A machine and its rows of the catalogue."""
+
+    machine: str
+    calibrations: list[dict[str, Any]]
+    measurements: list[dict[str, Any]]
+
+
+def draw(machines: Sequence[History]) -> bytes:
+    """Return a figure (PNG) with one colour a machine; rejected calibrations as crosses."""
+    made, axes = style.figure(10.0, 7.0, rows=3)
+    lag, gain, form = axes[:, 0]
+    for i, machine in enumerate(machines):
+        colour = _COLOURS[i % len(_COLOURS)]
+        for rejected, mark in ((False, "o"), (True, "x")):
+            rows = [r for r in machine.calibrations if (r["verdict"] == "rejected") == rejected]
+            _points(lag, rows, "delay", "delay_uncertainty", MICROSECOND_S, colour, mark)
+            _points(gain, rows, "static_gain", "static_gain_uncertainty", 1.0, colour, mark)
+        _points(form, machine.measurements, "deviation_rms", "", NANOMETRE_M, colour, ".")
+        lag.plot([], [], "o", color=colour, label=style.named(machine.machine) or "not named")
+    style.label(lag, y="µs", title="Lag of slow motion, k = 2")
+    style.label(gain, title="Static gain, k = 2")
+    style.label(form, y="nm", title="Deviation from nominal, rms by area", x="recorded (UTC)")
+    for panel in (lag, gain, form):
+        locator = AutoDateLocator()
+        panel.xaxis.set_major_locator(locator)
+        panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    if machines:
+        style.legend_above(lag)
+    return style.png(made, dpi=120)
+
+
+def _points(
+    panel: Any, rows: Sequence[Mapping[str, Any]], name: str, spread: str, unit: float,
+    colour: str, mark: str,
+) -> None:  # fmt: skip
+    known = [row for row in rows if row[name] is not None]
+    if not known:
+        return
+    when = [row["recorded_at"] or row["added_at"] for row in known]
+    values = np.array([row[name] for row in known]) / unit
+    bars = np.array([2 * (row[spread] or 0.0) / unit for row in known]) if spread else None
+    panel.errorbar(when, values, bars, fmt=mark, color=colour, markersize=4, linewidth=0.8)

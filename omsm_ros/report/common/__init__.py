@@ -1,1 +1,0 @@
-"""What all pages share: style, words for quantities, response figures."""

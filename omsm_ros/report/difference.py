@@ -1,0 +1,267 @@
+"""The HTML page of a comparison: verdict first, nothing fetched from anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, TermNumber
+from omsm_ros.core.comparison.compare import Comparison
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
+from omsm_ros.readable import NOTHING, count, figure, percent, plain, probability, quantity
+from omsm_ros.report import style
+from omsm_ros.report.measurement.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
+from omsm_ros.report.page_parts import Headline, fill, picture
+from omsm_ros.report.tables import Table
+from omsm_ros.report.verdict import Verdict
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+# Figures of a comparison: profiles of both and of their difference, E_n of the terms.
+
+# Of the aperture: the half width of a profile's band in places, and the places of a stretch.
+_HALF_WIDTH_PLACES, _STRETCH_PLACES = 1.5, 1.5
+_MOST_DIGITS = 5000
+_LINES = {"profile_x": (0.0, "along x", "x"), "profile_y": (np.pi / 2, "along y", "y")}
+
+
+def profiles(found: Comparison) -> dict[str, Figure]:
+    """Draw the profiles along x and y through the middle, and the mean over rings, by name."""
+    matched, agreement = found.matched, found.agreement
+    side = matched.grid.dx
+    x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
+    x, y = matched.x - x0, matched.y - y0
+    a, b = matched.without_fit(np.stack([matched.a, matched.b]))
+    spread = None if agreement is None else agreement.uncertainty
+    made = {}
+    for name, (angle, title, position) in _LINES.items():
+
+        def line(values: FloatArray, angle: float = angle) -> Profile:
+            return line_profile(
+                x, y, values, angle=angle,
+                half_width=_HALF_WIDTH_PLACES * side, spacing=_STRETCH_PLACES * side,
+            )  # fmt: skip
+
+        cuts = [line(values) for values in (a, b, matched.difference)]
+        band = None if spread is None else line(spread)
+        if len(cuts[0].position):
+            made[name] = _profile(cuts, band, f"Profile {title}", position)
+    rings = [
+        radial_profile(x, y, values, spacing=2 * side) for values in (a, b, matched.difference)
+    ]
+    if len(rings[0].position):
+        made["profile_radius"] = _profile(rings, None, "Mean over each ring", "radius")
+    return made
+
+
+def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position: str) -> Figure:
+    made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
+    upper, lower = axes[:, 0]
+    unit, name_of_unit = _unit(cuts[:2])
+    for cut, colour, name in zip(cuts, (style.BEFORE, style.AFTER), "AB", strict=False):
+        _line(upper, cut, unit, color=colour, label=name)
+    _line(lower, cuts[2], NANOMETRE_M, color=style.TRUTH, label="A − B")
+    if band is not None:
+        bound = COVERAGE_FACTOR * band.value / NANOMETRE_M
+        lower.fill_between(
+            band.position / MILLIMETRE_M, -bound, bound, color=style.AFTER, alpha=0.18,
+            linewidth=0, label="±U of a place, k = 2",
+        )  # fmt: skip
+    style.legend_above(upper)
+    style.legend_above(lower)
+    style.label(upper, y=f"height [{name_of_unit}]", title=title)
+    style.label(lower, x=f"{position} [mm]", y="A − B [nm]")
+    return made
+
+
+def _unit(cuts: Sequence[Profile]) -> tuple[float, str]:
+    """Return the unit in which their heights have no more than four digits, and its name."""
+    largest = max(float(np.nanmax(np.abs(cut.value), initial=0.0)) for cut in cuts)
+    units = ((NANOMETRE_M, "nm"), (MICROMETRE_M, "µm"), (MILLIMETRE_M, "mm"))
+    return next((u for u in units if largest < _MOST_DIGITS * u[0]), units[-1])
+
+
+def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
+    axes.plot(drawn.position / MILLIMETRE_M, drawn.value / unit, linewidth=1.1, **look)
+
+
+def terms(numbers: Sequence[TermNumber]) -> Figure:
+    """Draw E_n of the Zernike terms of the difference, the bounds at ±1."""
+    made, axes = style.figure(6.1, 3.6)
+    ax = axes[0, 0]
+    values = np.array([term.e_n for term in numbers])
+    colours = np.where(np.abs(values) > 1, style.BEFORE, style.AFTER)
+    ax.bar(np.arange(len(values)), values, color=list(colours), width=0.75)
+    for bound in (-1.0, 1.0):
+        ax.axhline(bound, color=style.TRUTH, linewidth=0.9, linestyle=(0, (4, 2.5)))
+    ax.axhline(0.0, color=style.MUTED, linewidth=0.6)
+    names = [f"{term.n},{term.m}" for term in numbers]
+    ax.set_xticks(np.arange(len(values)), names, rotation=90)
+    reach = max(1.3, 1.1 * float(np.max(np.abs(values))))
+    ax.set_ylim(-reach, reach)
+    style.label(ax, x="n, m", y="E_n", title="Zernike terms of the difference")
+    return made
+
+
+_VERDICTS = {
+    "agree": ("good", "The two measurements agree"),
+    "differ": ("bad", "The two measurements differ"),
+    "cannot tell": ("unknown", "Nobody can tell whether they agree"),
+}
+_MOST_IN_NANOMETRES_M = 5e-6
+CAPTIONS = {
+    "profile_x": "Through the middle: both measurements less the fitted freedoms, and A − B.",
+    "profile_y": "Through the middle: both measurements less the fitted freedoms, and A − B.",
+    "profile_radius": "What is the same all around, such as rings; drift of a spiral scan is here.",
+    "terms": "Difference over its expanded uncertainty, which holds for all terms together "
+    "with 95 %; beyond ±1 they disagree.",
+}
+
+
+def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -> str:
+    """Return the page as HTML; all text from outside is escaped.
+
+    facts: the content of ``difference.json``
+    """
+    drawn = profiles(found)
+    if found.agreement is not None:
+        drawn["terms"] = terms(found.agreement.terms)
+    drawing = script()
+    level, word = _VERDICTS[facts["verdict"]]
+    return fill(
+        "difference.html",
+        title=title,
+        date=date,
+        verdict=Verdict(level, word, tuple(facts["reasons"])),
+        reservations=facts["reservations"],
+        headlines=headlines(facts),
+        map=map_of(found),
+        figures={name: picture(style.png(figure)) for name, figure in drawn.items()},
+        caption=CAPTIONS.__getitem__,
+        records=[table for table in records(facts) if table.rows],
+        script=drawing,
+        script_policy=policy_of(drawing),
+    )
+
+
+def map_of(found: Comparison) -> EmbeddedMap:
+    """Return maps of the difference, of E_n and of both measurements less the fitted freedoms."""
+    matched, agreement = found.matched, found.agreement
+    a, b = matched.without_fit(np.stack([matched.a, matched.b]))
+
+    def layer(name: str, heights: FloatArray, unit: str, symmetric: bool = True) -> Layer:
+        return Layer(name, matched.x, matched.y, heights, unit, symmetric, matched.grid.dx)
+
+    layers = [layer("A − B", matched.difference, "nm")]
+    if agreement is not None:
+        e_n = matched.difference / (COVERAGE_FACTOR * agreement.uncertainty)
+        spread = layer("uncertainty, k = 1", agreement.uncertainty, "nm", symmetric=False)
+        layers += [layer("E_n", e_n, "1"), spread]
+    unit = "nm" if np.ptp(a) < _MOST_IN_NANOMETRES_M else "µm"
+    return embedded([*layers, layer("A", a, unit), layer("B", b, unit)])
+
+
+def headlines(facts: Mapping[str, Any]) -> list[Headline]:
+    """Return the numbers that a reader looks for first."""
+    difference = facts["difference"]
+    spread = difference["uncertainty"]
+    found = [
+        Headline(
+            "Difference, rms",
+            quantity(difference["rms"], "m"),
+            f"peak to valley {quantity(difference['peak_to_valley'], 'm')}",
+        ),
+        Headline(
+            "Expanded uncertainty of a place",
+            "not evaluated" if spread is None else quantity(COVERAGE_FACTOR * spread, "m"),
+            "k = 2, rms over the area",
+        ),
+    ]
+    if facts["within"] is not None:
+        text = f"probability of such a difference {probability(facts['probability'])}"
+        found.append(Headline("|E_n| < 1", f"{percent(facts['within'])} of the area", text))
+    text = f"{percent(difference['shared_area'])} of the smaller area"
+    return [*found, Headline("Places compared", count(difference["places"]), text)]
+
+
+def records(facts: Mapping[str, Any]) -> list[Table]:
+    """Return E_n, terms, what each brought, and how they were matched."""
+    return [_numbers(facts), _terms(facts), _sides(facts), _matching(facts)]
+
+
+def _numbers(facts: Mapping[str, Any]) -> Table:
+    rows = [
+        (
+            figure(name),
+            quantity(n["a"], "m", 5),
+            quantity(n["b"], "m", 5),
+            NOTHING if n["expanded"] is None else quantity(n["expanded"], "m"),
+            "not evaluated" if n["e_n"] is None else plain(n["e_n"]),
+        )
+        for name, n in facts["e_n"].items()
+    ]
+    return Table(
+        "Figures of both; U: 95 % for all together", ("A", "B", "U of the difference", "E_n"), rows
+    )
+
+
+def _terms(facts: Mapping[str, Any]) -> Table:
+    zernike = facts["zernike"] or {"terms": ()}
+    rows = [
+        (
+            f"Z({t['n']}, {t['m']})",
+            quantity(t["difference"], "m"),
+            quantity(t["expanded"], "m"),
+            plain(t["e_n"]),
+        )
+        for t in zernike["terms"]
+    ]
+    return Table("Zernike terms of A − B, one at the rim", ("A − B", "U, all terms", "E_n"), rows)
+
+
+def _sides(facts: Mapping[str, Any]) -> Table:
+    a, b = facts["a"], facts["b"]
+    rows = [("file", str(a["file"]), str(b["file"]))]
+    rows.append(("points", count(a["points"]), count(b["points"])))
+    for key, name in (
+        ("scatter", "scatter of a point about its neighbours"),
+        ("interpolation", "interpolation, rms, at most"),
+        ("cell", "cell of the local fits"),
+    ):
+        rows.append((name, quantity(a[key], "m"), quantity(b[key], "m")))
+    sources = dict.fromkeys([*(a["sources"] or {}), *(b["sources"] or {})])
+    for source in sources:
+        sizes = ((side["sources"] or {}).get(source) for side in (a, b))
+        name = f"{source.replace('_', ' ')}, on all together, rms"
+        rows.append((name, *(quantity(size, "m") for size in sizes)))
+    rows.append(("drift known by", a["drift_from"], b["drift_from"]))
+    notes = ("; ".join(side.get("notes") or ()) for side in (a, b))
+    rows.append(("notes", *(note or NOTHING for note in notes)))
+    return Table("What each brought, k = 1", ("A", "B"), rows)
+
+
+_UNITS = {"piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad"}
+
+
+def _matching(facts: Mapping[str, Any]) -> Table:
+    moved = facts["registration"]["moved"]
+    rows = [
+        (
+            f"B moved in {name}",
+            quantity(value, _UNITS[name]) if name in _UNITS else f"{plain(value)} 1/m",
+        )
+        for name, value in moved.items()
+    ]
+    refused = facts["registration"]["not_determined"]
+    rows += [(f"not moved in {name}", str(why)) for name, why in refused.items()]
+    rows += [
+        ("resampled by", facts["resampling"]["method"]),
+        ("places", quantity(facts["resampling"]["spacing"], "m")),
+        ("one and the same error in both", ", ".join(facts["common_errors"]) or "none"),
+        ("errors of unknown form correlated over", quantity(facts["correlation_length"], "m")),
+    ]
+    return Table("Matching", (), rows)

@@ -1,1 +1,0 @@
-"""Pages that set the paper's experiments beside ours."""

@@ -1,0 +1,278 @@
+"""From a cloud of any size to an image: the mean of each pixel, narrow gaps closed."""
+
+from __future__ import annotations
+
+import io
+import json
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from hashlib import sha256
+from importlib import resources
+
+import matplotlib
+import numpy as np
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.area_weights import area_weights
+from omsm_ros.errors import DataError
+from omsm_ros.report import style
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+MAX_PIXELS = 400
+_POINTS_PER_PIXEL = 2
+# Beyond any image, and its square still a whole number.
+_FAR = 10_000
+# Of the steps from pixel to pixel along rows and columns, those that cross from track to track.
+_CROSSING = 0.65
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Raster:
+    """Means on square pixels.
+
+    image: (rows along y, columns along x), NaN where no point is near
+    extent: left, right, bottom, top of the image [m]
+    """
+
+    image: FloatArray
+    extent: tuple[float, float, float, float]
+
+
+def rasterise(x: FloatArray, y: FloatArray, value: FloatArray) -> Raster:
+    """Return the mean of ``value`` at x, y [m], each (n,), on at most 400 × 400 pixels.
+
+    A pixel between two tracks takes the weighted mean of its surroundings; a pixel
+    farther from any point than the tracks are from each other stays NaN, so that
+    dropouts remain to be seen.
+    """
+    if not len(x) or not np.all(np.isfinite(x) & np.isfinite(y) & np.isfinite(value)):
+        raise DataError("a map needs at least one point, and finite ones only")
+    pixels = int(np.clip(np.sqrt(len(x) / _POINTS_PER_PIXEL), 8, MAX_PIXELS))
+    pitch = max(np.ptp(x), np.ptp(y)) / pixels or 1.0
+    column, columns = _pixel(x, pitch)
+    row, rows = _pixel(y, pitch)
+    index = row * columns + column
+    count, total = (
+        np.asarray(np.bincount(index, each, rows * columns), np.float64).reshape(rows, columns)
+        for each in (None, value)
+    )
+    left, bottom = float(x.min()), float(y.min())
+    extent = (left, left + columns * pitch, bottom, bottom + rows * pitch)
+    return Raster(_close_gaps(total, count), extent)
+
+
+def _pixel(position: FloatArray, pitch: float) -> tuple[IntArray, int]:
+    number = np.floor((position - position.min()) / pitch).astype(np.int64)
+    # The largest coordinate lies on the outer edge of the last pixel.
+    count = max(int(np.ceil(np.ptp(position) / pitch - 1e-9)), 1)
+    return np.minimum(number, count - 1), count
+
+
+def _close_gaps(total: FloatArray, count: FloatArray) -> FloatArray:
+    away, reach = _near(count > 0)
+    spread = [smoothed(part, reach / 2) for part in (total, count)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = np.where(count > 0, total / count, spread[0] / spread[1])
+    return np.where(away <= reach, image, np.nan)
+
+
+def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+    """Return pixels to the nearest filled one, exact up to the reach of a gap to be closed."""
+    steps = np.concatenate([_steps(filled), _steps(filled.T)])
+    if not len(steps):
+        return distances(filled, 2), 1.5
+    # Along straight tracks half of all steps are of one pixel; the rest cross from one to the
+    # next. A hole, however large, is crossed once in a row and counts as one step of many.
+    between = float(np.quantile(steps, _CROSSING))
+    reach = max(0.55 * between, 1.5)
+    return distances(filled, int(np.ceil(reach))), reach
+
+
+def _steps(filled: NDArray[np.bool_]) -> IntArray:
+    """Return pixels from each filled one of an image to the next filled one of its row."""
+    row, column = np.nonzero(filled)
+    return np.diff(column)[np.diff(row) == 0]
+
+
+def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
+    """Return pixels to the nearest filled one of an image (rows, columns) that has one.
+
+    First along the columns, then the least sum of squares over the columns beside. Exact where
+    it is no more than ``within``, elsewhere never less than the truth.
+    """
+    rows, columns = filled.shape
+    row = np.arange(rows)[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(filled, row, -_FAR), axis=0)
+    after = np.minimum.accumulate(np.where(filled, row, _FAR)[::-1], axis=0)[::-1]
+    along = np.minimum(row - before, after - row).astype(np.float64) ** 2
+    nearest = along.copy()
+    for aside in range(1, min(within + 1, columns)):
+        left, right = slice(None, -aside), slice(aside, None)
+        nearest[:, left] = np.minimum(nearest[:, left], along[:, right] + aside**2)
+        nearest[:, right] = np.minimum(nearest[:, right], along[:, left] + aside**2)
+    return np.sqrt(nearest)
+
+
+def smoothed(image: FloatArray, sigma: float) -> FloatArray:
+    """Return the image under a Gaussian of ``sigma`` pixels, cut off at four; zero beyond."""
+    rows, columns = (_gaussian(size, sigma) for size in image.shape)
+    return np.asarray(rows @ image @ columns, np.float64)
+
+
+def _gaussian(size: int, sigma: float) -> FloatArray:
+    """Return the weights (size, size) of each pixel of a line for each other one."""
+    cut = int(4 * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(max(size, cut + 1)) / sigma) ** 2)
+    weights[cut + 1 :] = 0.0
+    apart = abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    return np.asarray((weights / (2 * weights.sum() - weights[0]))[apart])
+
+
+# The points of a measurement as the figures want them.
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CloudView:
+    """Corrected points in the order they were taken, each array of shape (n,), SI.
+
+    time: since the start of the scan [s]
+    x, y: position in the workpiece frame [m]
+    height: corrected [m] (Eq. 10)
+    raw_height: encoder plus probe as read, uncorrected [m] (Eq. 2)
+    dynamic_error: (1 - G_m) X_d [m] (Eq. 5), what the correction took away
+    uncertainty: standard uncertainty of height [m], k = 1
+    """
+
+    time: FloatArray
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    raw_height: FloatArray
+    dynamic_error: FloatArray
+    uncertainty: FloatArray
+
+    def __post_init__(self) -> None:
+        lengths = {name: len(getattr(self, name)) for name in (f.name for f in fields(self))}
+        if len(set(lengths.values())) != 1 or not len(self.x):
+            raise DataError(f"cloud of {lengths!r} values, expected one length, 1 or more")
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @cached_property
+    def area(self) -> FloatArray:
+        """The area that each point stands for, (n,), of mean 1."""
+        return area_weights(self.x, self.y)
+
+
+# Maps as a page embeds them: heights of 16 bits in a PNG, and the script that draws them.
+#
+# The page needs no network and no library; the script may draw whatever else calls its ``set``.
+
+_STEPS = 65_534
+_ROBUST_PERCENT = (0.25, 99.75)
+_COLOURS = 128
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """One map: ``heights`` [m] at x, y [m], each (n,), in ``unit`` "nm" or "µm"; numbers in "1".
+
+    symmetric: colours about zero, for deviations; else from the least to the greatest
+    pitch: of the grid on which all points lie [m]; 0: they are scattered
+    """
+
+    name: str
+    x: FloatArray
+    y: FloatArray
+    heights: FloatArray
+    unit: str
+    symmetric: bool = True
+    pitch: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class EmbeddedMap:
+    """data: JSON for the script;  names: of its layers"""
+
+    data: str
+    names: tuple[str, ...]
+
+
+def embedded(layers: Sequence[Layer]) -> EmbeddedMap:
+    """Return maps for a page, each of at most 400 × 400 pixels."""
+    colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, _COLOURS))[:, :3]
+    content = {
+        "colours": "".join(f"{round(255 * part):02x}" for row in colours for part in row),
+        "missing": style.MISSING.lstrip("#"),
+        "layers": [_entry(layer) for layer in layers],
+    }
+    # Within a script's tags nothing is unescaped, and a name could end them.
+    data = json.dumps(content, separators=(",", ":")).replace("<", r"\u003c")
+    return EmbeddedMap(data, tuple(layer.name for layer in layers))
+
+
+def script() -> str:
+    """Return the script of the maps."""
+    folder = resources.files("omsm_ros.report") / "templates"
+    return (folder / "surface_map.js").read_text(encoding="utf-8")
+
+
+def policy_of(text: str) -> str:
+    """Return what a content security policy calls this script, and no other."""
+    return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'"
+
+
+def _entry(layer: Layer) -> dict[str, object]:
+    units = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "1": 1.0}
+    if layer.unit not in units:
+        raise DataError(f"unit {layer.unit!r} of a map is unknown, expected one of {[*units]}")
+    raster = _on_its_grid(layer) if layer.pitch else rasterise(layer.x, layer.y, layer.heights)
+    heights = raster.image / units[layer.unit]
+    known = heights[np.isfinite(heights)]
+    least, span = float(known.min()), float(np.ptp(known))
+    step = span / _STEPS or 1.0
+    codes = np.where(np.isfinite(heights), 1 + np.round((heights - least) / step), 0)
+    return {
+        "name": layer.name,
+        "unit": "" if layer.unit == "1" else layer.unit,
+        "least": least,
+        "step": step,
+        "extent": [edge / MILLIMETRE_M for edge in raster.extent],
+        "full": _limits(known.min(), known.max(), layer.symmetric),
+        "robust": _limits(*np.percentile(known, _ROBUST_PERCENT), layer.symmetric),
+        "png": _png(codes.astype(np.uint16)),
+    }
+
+
+def _on_its_grid(layer: Layer) -> Raster:
+    """Return a pixel for each place of the layer's grid."""
+    left, bottom = (float(values.min()) for values in (layer.x, layer.y))
+    column, row = (
+        np.round((values - least) / layer.pitch).astype(np.int64)
+        for values, least in ((layer.x, left), (layer.y, bottom))
+    )
+    image = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    image[row, column] = layer.heights
+    left, bottom = left - layer.pitch / 2, bottom - layer.pitch / 2
+    right = left + image.shape[1] * layer.pitch
+    return Raster(image, (left, right, bottom, bottom + image.shape[0] * layer.pitch))
+
+
+def _limits(low: float, high: float, symmetric: bool) -> list[float]:
+    if symmetric:
+        bound = max(abs(float(low)), abs(float(high))) or 1.0
+        return [-bound, bound]
+    return [float(low), float(high) if high > low else float(low) + 1.0]
+
+
+def _png(codes: np.ndarray) -> str:
+    """Return a picture whose red and green are the two bytes of each code, first row lowest."""
+    pixels = np.stack([codes >> 8, codes & 255, np.zeros_like(codes)], axis=2).astype(np.uint8)
+    content = io.BytesIO()
+    imsave(content, pixels, format="png", pil_kwargs=dict(style.FAST_PNG))
+    return b64encode(content.getvalue()).decode()

@@ -1,0 +1,211 @@
+"""Figures of the probe's dynamics: Bode plot and step response."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, response_band
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import DataError
+from omsm_ros.report import style
+from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLISECOND_S, NANOMETRE_M
+
+_LOWEST_HZ = 0.1
+# Of the logarithm of a gain: where nothing is known the band leaves the picture all the same.
+_WIDEST = 100.0
+_NM_PER_UM = MICROMETRE_M / NANOMETRE_M
+_SMALLEST_SHOWN_NM_PER_UM = 1e-4
+
+
+class HasResponse(Protocol):
+    """Whatever can be asked for its response: a transfer function, the truth of the twin."""
+
+    def response(self, frequency: FloatArray) -> ComplexArray:
+        """Return G at ``frequency`` (n,) [Hz]."""
+        ...
+
+
+def frequencies(identified: Calibration) -> FloatArray:
+    """Return frequencies of a Bode plot [Hz]: up to Nyquist's, for the data say nothing beyond."""
+    return np.geomspace(_LOWEST_HZ, 0.5 / identified.sample_period, 600)
+
+
+def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
+    """Draw gain, phase, and the error of a motion before and after the correction.
+
+    true: the twin's G_m, drawn where known
+    sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
+    """
+    if not (np.isfinite(sample_period) and sample_period > 0):
+        raise DataError(f"sample_period {sample_period!r} s, expected a positive number")
+    frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
+    made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
+    gain, phase, error = axes[:, 0]
+    draw_gain(gain, frequency, identified, true, title="Response of the probe to the axis")
+    draw_phase(phase, frequency, identified, true)
+    phase.set_xlabel("")
+    _draw_error(error, frequency, identified, true)
+    return made
+
+
+def draw_gain(
+    axes: Axes,
+    frequency: FloatArray,
+    identified: Calibration,
+    true: HasResponse | None,
+    title: str = "",
+) -> None:
+    """Draw |G_m| with its 95 % band."""
+    magnitude = np.abs(identified.dynamics.response(frequency))
+    band = np.exp(np.minimum(COVERAGE_FACTOR * _band(identified, frequency).gain, _WIDEST))
+    _draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
+    if true is not None:
+        _draw_true(axes, frequency, np.abs(true.response(frequency)))
+    _frequency_axis(axes, frequency, identified)
+    drawn = magnitude if true is None else np.append(magnitude, np.abs(true.response(frequency)))
+    low, high = float(drawn.min()), float(drawn.max())
+    room = 0.12 * max(high - low, 0.02)
+    axes.set_ylim(low - room, high + room)
+    if identified.valid_up_to < frequency[-1]:
+        axes.annotate(
+            "not trusted", (1, 1), (-4, -4), "axes fraction", "offset points", ha="right",
+            va="top", fontsize=style.TEXT_PT - 1, color=style.MUTED,
+        )  # fmt: skip
+    # The curve starts at 1; the legend goes to the emptier side of it.
+    style.legend(axes, loc="upper left" if high - 1 > 1 - low else "lower left")
+    style.label(axes, y="gain [1]", title=title)
+
+
+def draw_phase(
+    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
+) -> None:
+    """Draw the phase of G_m [deg] with its 95 % band."""
+    angle = _phase(identified.dynamics, frequency)
+    band = COVERAGE_FACTOR * _band(identified, frequency).phase / DEGREE_RAD
+    _draw_band(axes, frequency, angle - band, angle, angle + band)
+    if true is not None:
+        _draw_true(axes, frequency, _phase(true, frequency))
+    _frequency_axis(axes, frequency, identified)
+    room = 0.12 * max(np.ptp(angle), 1.0)
+    axes.set_ylim(angle.min() - room, angle.max() + room)
+    style.label(axes, x="frequency [Hz]", y="phase [deg]")
+
+
+def _band(identified: Calibration, frequency: FloatArray) -> Band:
+    return response_band(identified.dynamics, identified.covariance, frequency)
+
+
+def _phase(system: HasResponse, frequency: FloatArray) -> FloatArray:
+    return np.asarray(np.unwrap(np.angle(system.response(frequency))) / DEGREE_RAD)
+
+
+def _draw_error(
+    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
+) -> None:
+    fitted = identified.dynamics.response(frequency)
+    reference = fitted if true is None else true.response(frequency)
+
+    def shown(error: FloatArray) -> FloatArray:
+        return np.maximum(error * _NM_PER_UM, _SMALLEST_SHOWN_NM_PER_UM)
+
+    before = shown(np.abs(1 - reference))
+    style.logarithmic(axes.yaxis)
+    axes.plot(frequency, before, color=style.BEFORE, linewidth=1.4, label="uncorrected")
+    band = _band(identified, frequency)
+    bound = COVERAGE_FACTOR * np.hypot(band.gain, band.phase) * np.abs(fitted)
+    if np.any(bound > 0):
+        floor = np.full_like(frequency, _SMALLEST_SHOWN_NM_PER_UM)
+        look: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
+        label = "corrected, 95 % bound"
+        axes.fill_between(frequency, floor, shown(bound), label=label, **look)
+    if true is not None:
+        rest = shown(np.abs(fitted - reference))
+        axes.plot(frequency, rest, color=style.AFTER, linewidth=1.4, label="corrected, true")
+    axes.set_ylim(_SMALLEST_SHOWN_NM_PER_UM, max(before.max() * 3, 1.0))
+    _frequency_axis(axes, frequency, identified)
+    style.legend_above(axes)
+    style.label(axes, x="frequency of the motion [Hz]", y="error per motion [nm/µm]")
+
+
+def _draw_band(
+    axes: Axes, frequency: FloatArray, low: FloatArray, middle: FloatArray, high: FloatArray
+) -> None:
+    if np.any(high > low):
+        axes.fill_between(
+            frequency, low, high, color=style.AFTER, alpha=0.22, linewidth=0, label="95 % band"
+        )
+    axes.plot(frequency, middle, color=style.AFTER, linewidth=1.6, label="identified")
+
+
+def _draw_true(axes: Axes, frequency: FloatArray, value: FloatArray) -> None:
+    dashes = (0, (4, 2.5))
+    axes.plot(frequency, value, color=style.TRUTH, linewidth=1.0, linestyle=dashes, label="true")
+
+
+def _frequency_axis(axes: Axes, frequency: FloatArray, identified: Calibration) -> None:
+    style.logarithmic(axes.xaxis, every=(1.0, 2.0, 5.0))
+    axes.set_xlim(frequency[0], frequency[-1])
+    if identified.valid_up_to < frequency[-1]:
+        axes.axvspan(identified.valid_up_to, frequency[-1], color=style.MISSING, zorder=0)
+        axes.axvline(identified.valid_up_to, color=style.MUTED, linewidth=0.8, linestyle=":")
+
+
+def step_response(
+    time: FloatArray,
+    encoder: FloatArray,
+    probe: FloatArray,
+    predicted: FloatArray | None = None,
+) -> Figure:
+    """Draw one of the steepest moves, an edge of a step test, and how far the probe is from it.
+
+    Each array is of shape (n,), positions in [m].
+
+    time: [s];  encoder: position of the axis
+    probe: motion the probe saw, -distance / static gain on a fixed target, in any offset
+    predicted: encoder through the identified G_m
+    """
+    given = [part for part in (time, encoder, probe, predicted) if part is not None]
+    lengths = {len(part) for part in given}
+    if len(lengths) != 1 or len(time) < 3:
+        raise DataError(f"step response of {sorted(lengths)!r} samples, expected one length of 3+")
+    window = _steepest(time, encoder)
+    made, axes = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
+    upper, lower = axes[:, 0]
+    edge = encoder[window]
+    since = (time[window] - time[window][_start(edge)]) / MILLISECOND_S
+    seen = probe[window] - np.median(probe[window] - edge)
+
+    def draw(where: Axes, value: FloatArray, colour: str, text: str, line: Any = "-") -> None:
+        where.plot(since, value, color=colour, linewidth=1.3, linestyle=line, label=text)
+
+    draw(upper, (edge - edge[0]) / MICROMETRE_M, style.MUTED, "axis (encoder)")
+    draw(upper, (seen - edge[0]) / MICROMETRE_M, style.BEFORE, "probe")
+    draw(lower, (seen - edge) / NANOMETRE_M, style.BEFORE, "probe − axis")
+    if predicted is not None:
+        model, name = predicted[window], "axis through $G_m$"
+        draw(upper, (model - edge[0]) / MICROMETRE_M, style.AFTER, name, (0, (3, 2)))
+        draw(lower, (seen - model) / NANOMETRE_M, style.AFTER, f"probe − {name}")
+    style.label(upper, y="motion [µm]", title="Steepest move")
+    style.label(lower, x="time since it began [ms]", y="error [nm]")
+    style.legend_above(upper)
+    style.legend_above(lower)
+    return made
+
+
+def _steepest(time: FloatArray, encoder: FloatArray) -> slice:
+    speed = np.abs(np.diff(encoder))
+    middle = int(np.argmax(speed > 0.9 * speed.max()))
+    period = float(np.median(np.diff(time)))
+    before, after = round(30 * MILLISECOND_S / period), round(60 * MILLISECOND_S / period)
+    return slice(max(middle - before, 0), middle + after)
+
+
+def _start(edge: FloatArray) -> int:
+    moved = np.abs(edge - edge[0]) > 0.01 * np.ptp(edge)
+    return int(np.argmax(moved))

@@ -1,0 +1,313 @@
+"""The page of ``omsm spectrum``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from omsm_ros.core.ripple.density import Density, density, evenly, smoothed
+from omsm_ros.core.ripple.ripple_guard import Named
+from omsm_ros.core.ripple.scan_signal import PATH, TIME
+from omsm_ros.core.ripple.source_hypotheses import (
+    ARTEFACT,
+    FOLDED,
+    KINDS,
+    PART,
+    SYNCHRONOUS,
+    UNDECIDED,
+    VIBRATION,
+    StudiedScan,
+)
+from omsm_ros.readable import count, plain, quantity
+from omsm_ros.report import style
+from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.tables import Table
+from omsm_ros.report.verdict import Verdict
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+# Spectra of scans, their lines in the colour of their kind.
+
+# Okabe and Ito, apart for every kind of sight.
+COLOURS = {
+    PART: "#009E73",
+    VIBRATION: "#D55E00",
+    FOLDED: "#CC79A7",
+    SYNCHRONOUS: "#0072B2",
+    ARTEFACT: "#E69F00",
+    UNDECIDED: "#1F2933",
+}
+_WIDTH_IN, _ROW_IN = 9.2, 2.5
+_MOST_NAMED = 8
+
+
+def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
+    """Draw the amplitude spectral density of each scan over time, its lines named."""
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
+    for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
+        signal = studied.signal
+        values = evenly(signal.time, studied.formless.residual, signal.period)
+        _curve(row, density(values, signal.period), 1.0)
+        _marks(row, named, TIME, 1.0, signal.duration)
+        style.label(row, y="nm/√Hz", title=f"{style.named(signal.name)}, over time")
+    _kinds(axes[0, 0], [row for _, named in scans for row in named])
+    style.label(axes[-1, 0], x="frequency [Hz]")
+    return made
+
+
+def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+    """Draw the density along the path over wavelength; None where no scan moves over the part."""
+    moving = [(s, n) for s, n in scans if PATH in s.coordinates]
+    if not moving:
+        return None
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(moving) + 0.3, len(moving), 1, sharex=True)
+    for row, (studied, named) in zip(axes[:, 0], moving, strict=True):
+        signal = studied.signal
+        step = float(np.median(np.diff(signal.path) / np.diff(signal.sample)))
+        values = evenly(signal.path, studied.formless.residual, step)
+        _curve(row, density(values, step), MICROMETRE_M, over=True)
+        _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
+        row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
+        style.label(row, y="nm·√mm", title=f"{style.named(signal.name)}, along the path")
+    style.label(axes[-1, 0], x="wavelength [µm]; dotted: twice the sampling distance")
+    return made
+
+
+def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) -> None:
+    frequency, level = smoothed(spectrum)
+    place = 1 / frequency / unit if over else frequency
+    height = np.sqrt(level / MILLIMETRE_M if over else level) / NANOMETRE_M
+    style.logarithmic(axes.xaxis)
+    style.logarithmic(axes.yaxis)
+    axes.plot(place, height, color=style.MUTED, linewidth=0.8)
+
+
+def _marks(axes: Axes, named: Sequence[Named], coordinate: str, unit: float, extent: float) -> None:
+    """Mark the lines: amplitude a stands a²/2 high in one resolution."""
+    for row in named:
+        if coordinate not in row.line.possible:
+            continue
+        at = row.line.possible[coordinate]
+        scale = extent / MILLIMETRE_M if coordinate == PATH else extent
+        height = row.line.amplitude * np.sqrt(scale / 2) / NANOMETRE_M
+        place = 1 / at / unit if coordinate == PATH else at
+        axes.plot([place], [height], "o", color=COLOURS[row.kind], markersize=5, zorder=5)
+
+
+def _kinds(axes: Axes, named: Sequence[Named]) -> None:
+    for kind in KINDS:
+        if any(row.kind == kind for row in named):
+            axes.plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
+    if axes.get_legend_handles_labels()[0]:
+        style.legend_above(axes)
+
+
+def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:
+    """Draw the density of the path's own motion against the calibrated band (Fig. 7c)."""
+    made, axes = style.figure(_WIDTH_IN, 3.0)
+    one = axes[0, 0]
+    style.logarithmic(one.xaxis)
+    if any(np.any(spectrum.density > 0) for _, spectrum in spectra):
+        style.logarithmic(one.yaxis)
+    for k, (name, spectrum) in enumerate(spectra):
+        frequency, level = smoothed(spectrum)
+        colour = list(COLOURS.values())[k % len(COLOURS)]
+        # A Z that stands still has no density, and no logarithm.
+        if np.any(level > 0):
+            heights, shown = np.sqrt(level) / NANOMETRE_M, style.named(name)
+            one.plot(frequency, heights, linewidth=0.9, color=colour, label=shown)
+    if valid_up_to is not None:
+        top = max(float(s.frequency[-1]) for _, s in spectra)
+        one.axvspan(valid_up_to, top, color=style.MISSING, zorder=0, label="not calibrated")
+    style.label(one, x="frequency [Hz]", y="nm/√Hz", title="Motion of Z")
+    if one.get_legend_handles_labels()[1]:
+        style.legend(one, loc="upper right")
+    return made
+
+
+def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+    """Draw every line of every scan at its frequency in time: what stays is no texture.
+
+    None where there is no such line.
+    """
+    if not any(TIME in row.line.possible for _, named in scans for row in named):
+        return None
+    made, axes = style.figure(_WIDTH_IN, 0.5 * len(scans) + 1.2)
+    one = axes[0, 0]
+    for level, (_, named) in enumerate(scans):
+        for row in named:
+            if TIME in row.line.possible:
+                at = row.line.possible[TIME]
+                one.plot(
+                    [at, at], [level - 0.35, level + 0.35], color=COLOURS[row.kind], linewidth=1.6
+                )
+    style.logarithmic(one.xaxis, every=(1.0, 2.0, 5.0))
+    low, high = one.get_xlim()
+    # Lines near one another would leave no number between them.
+    one.set_xlim(min(low, high / 10), high)
+    one.set_yticks(range(len(scans)), [style.named(s.signal.name) for s, _ in scans])
+    one.invert_yaxis()
+    style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")
+    return made
+
+
+CAPTIONS = {
+    "time": "Spectral density over time; each dot is a line, as high as it stands out.",
+    "path": "The same along the path: what is on the part has its wavelength here in every scan.",
+    "evidence": "Lines that stay where they are at another speed are not on the part.",
+    "motion": "The path's own motion. Grey: beyond what the calibration knows.",
+}
+
+
+@dataclass(frozen=True)
+class SpectrumPage:
+    """summary: of ``spectrum.json``;  figures: PNG files by the names in :data:`CAPTIONS`"""
+
+    summary: Mapping[str, Any]
+    figures: Mapping[str, bytes]
+
+
+def drawn(
+    scans: Sequence[tuple[StudiedScan, Sequence[Named], Density]], valid_up_to: float | None
+) -> dict[str, bytes]:
+    """Return PNG files of all figures."""
+    pairs = [(studied, named) for studied, named, _ in scans]
+    spectra = [(studied.signal.name, motion) for studied, _, motion in scans]
+    made = {
+        "time": over_time(pairs),
+        "path": over_path(pairs),
+        "evidence": evidence(pairs),
+        "motion": motion(spectra, valid_up_to),
+    }
+    return {name: style.png(figure) for name, figure in made.items() if figure is not None}
+
+
+def render(page: SpectrumPage) -> str:
+    """Return the page as HTML."""
+    summary = page.summary
+    scans = summary["scans"]
+    return fill_study(
+        StudyPage(
+            title="Lines in the spectrum",
+            subtitle=", ".join(scan["name"] for scan in scans),
+            verdict=_verdict(summary),
+            sections=(
+                Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
+                Section("Evidence", ("evidence", "path"), (_felt_table(scans),)),
+                Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
+                Section("Band stop", tables=(_stop_table(scans),)),
+            ),
+            captions=CAPTIONS,
+            figures=page.figures,
+            footer=str(summary["normalisation"]),
+        )
+    )
+
+
+def _verdict(summary: Mapping[str, Any]) -> Verdict:
+    counts = summary["counts"]
+    found = tuple(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
+    if not found:
+        return Verdict("good", "No line beyond 3 σ", ("nothing but noise",))
+    if counts[UNDECIDED]:
+        wanted = sorted({p["needs"] for s in summary["scans"] for p in s["peaks"] if p["needs"]})
+        return Verdict("unknown", "Not all decided", (*found, *wanted))
+    return Verdict("good", "All lines named", found)
+
+
+def _peak_table(scan: Mapping[str, Any]) -> Table:
+    rows = [
+        (
+            peak["kind"],
+            quantity(peak["frequency"], "Hz", 5),
+            quantity(peak["wavelength_along_path"] or peak["wavelength_along_radius"], "m", 4),
+            quantity(peak["amplitude"], "m"),
+            plain(peak["significance"]),
+            _true(peak),
+            "; ".join([*peak["evidence"], *([peak["needs"]] if peak["needs"] else [])]),
+        )
+        for peak in scan["peaks"]
+    ]
+    columns = ("seen at", "wavelength", "amplitude", "σ", "truly", "because")
+    return Table(scan["name"], columns, rows, prose="because")
+
+
+def _true(peak: Mapping[str, Any]) -> str:
+    if peak["true_frequency"]:
+        return quantity(peak["true_frequency"], "Hz", 5)
+    if peak["true_wavelength"]:
+        return quantity(peak["true_wavelength"], "m", 4)
+    return f"{peak['order']} a turn" if peak["order"] else ""
+
+
+def _felt_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        (
+            f"{scan['name']}, {line['axis']}",
+            quantity(line["frequency"], "Hz", 5),
+            f"{plain(line['acceleration'])} m/s²",
+            quantity(line["displacement"], "m"),
+            plain(line["significance"]),
+        )
+        for scan in scans
+        if scan["accelerometer"]
+        for line in scan["accelerometer"]["lines"]
+    ]
+    return Table("Felt by the accelerometer", ("frequency", "acceleration", "motion", "σ"), rows)
+
+
+def _scan_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        (
+            scan["name"],
+            count(scan["samples"]["analysed"]),
+            quantity(scan["duration"], "s"),
+            quantity(scan["spindle_speed_rpm"], "rpm"),
+            quantity(scan["path_length"], "m"),
+            quantity(scan["form"]["rms_removed"], "m"),
+            quantity(scan["noise"]["rms"], "m"),
+            quantity(scan["noise"]["amplitude"], "m"),
+            quantity(scan["motion"]["outside_band_rms"], "m"),
+        )
+        for scan in scans
+    ]
+    columns = (
+        *("points", "duration", "spindle", "path", "form removed, rms", "left, rms"),
+        *("σ of an amplitude", "motion beyond the band"),
+    )
+    return Table("", columns, rows)
+
+
+def _sampling_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        (
+            f"{scan['name']}, radius {quantity(place['radius'], 'm')}",
+            quantity(place["distance"], "m", 4),
+            quantity(place["shortest_wavelength"], "m", 4),
+        )
+        for scan in scans
+        for place in scan["sampling"]
+    ]
+    return Table("Sampling of the part", ("distance", "shortest wavelength"), rows)
+
+
+def _stop_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        (
+            scan["name"],
+            ", ".join(f"{plain(low)} to {plain(high)} Hz" for low, high in stop["bands"]),
+            quantity(stop["rms_before"], "m"),
+            quantity(stop["rms_after"], "m"),
+            quantity(stop["rms_removed"], "m"),
+            "0, forward and backward",
+            quantity(stop["settling_at_the_ends"], "s"),
+        )
+        for scan in scans
+        if (stop := scan["band_stop"])
+    ]
+    columns = ("bands", "rms before", "rms after", "removed", "phase", "rings at the ends")
+    return Table("", columns, rows)

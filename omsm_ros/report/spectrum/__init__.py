@@ -1,1 +1,0 @@
-"""The page of spectra: every line with its name and its evidence."""

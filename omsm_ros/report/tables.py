@@ -1,0 +1,185 @@
+"""The numbers of a report as rows of text, with their units."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.errors import CalibrationError
+from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
+
+_OPEN = "not evaluated"
+_FIGURE_NAMES = {
+    "peak_to_valley": "peak to valley",
+    "rms": "rms, every point alike",
+    "rms_area_weighted": "rms, every area alike",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """``rows`` of a label and one text a column; ``columns`` may be empty for no heading.
+
+    prose: the column that holds sentences rather than figures, empty for none
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[tuple[str, ...]]
+    prose: str = ""
+
+
+def part(mapping: Mapping[str, Any], *path: str) -> Any:
+    """Return what lies at ``path`` in nested mappings, None where it is missing."""
+    found: Any = mapping
+    for key in path:
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found
+
+
+def error_table(summary: Mapping[str, object]) -> Table:
+    """Return the deviation and dynamic error, before and after the correction."""
+    rows = []
+    for key, name in _FIGURE_NAMES.items():
+        both = [part(summary, "deviation", side, key) for side in ("raw", "corrected")]
+        rows.append((f"deviation from nominal, {name}", *(quantity(v, "m") for v in both)))
+    for key in ("peak_to_valley", "rms"):
+        both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
+        label = f"dynamic error, {_FIGURE_NAMES[key].split(',')[0]}"
+        rows.append((label, *(quantity(v, "m") for v in both)))
+    for key in ("rms_before_fit", "rms"):
+        value = part(summary, "form", "deviation", key)
+        label = {"rms_before_fit": "as it sits", "rms": "registered"}[key]
+        found = () if value is None else (measured(value["value"], value["uncertainty"], "m"),)
+        rows += [(f"deviation from nominal along the normal, rms, {label}", "", *found)]
+    for key in ("median", "largest"):
+        value = part(summary, "uncertainty", key)
+        rows.append((f"standard uncertainty of a height, {key}", "", quantity(value, "m")))
+    known = [row for row in rows if set(row[1:]) - {NOTHING, ""}]
+    return Table("Errors", ("uncorrected", "corrected"), known)
+
+
+def budget_table(summary: Mapping[str, object]) -> Table:
+    """Return every source of uncertainty, the largest first, those not evaluated last."""
+    rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
+    ordered = sorted(rows, key=lambda row: (row["status"] == _OPEN, -(row["height"] or 0.0)))
+    return Table(
+        "Uncertainty of the heights, k = 1, rms over the scan",
+        ("of the source", "of the heights", "acts", "known by"),
+        [_budget_row(row) for row in ordered],
+        prose="known by",
+    )
+
+
+def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    size, unit = row["standard_uncertainty"], row["unit"]
+    known = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
+    return (
+        f"{row['source'].replace('_', ' ')} ({row['says']})",
+        _sized(size, unit),
+        quantity(row["height"], "m"),
+        "on each point" if row["kind"] == "random" else "on all together",
+        known,
+    )
+
+
+def _sized(size: object, unit: str) -> str:
+    """Return a size in its unit; a share or a rate per radian has no prefix."""
+    if unit == "1":
+        return plain(size) if size is not None else NOTHING
+    return quantity(size, unit)
+
+
+def motion_table(summary: Mapping[str, object]) -> Table:
+    """Return whether the scan was slow enough, and H good enough for it."""
+    prediction: Mapping[str, Any] = part(summary, "prediction") or {}
+    outside = prediction.get("outside_band_fraction")
+    factor = prediction.get("speed_factor")
+    rows = [
+        ("left by the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
+        (
+            "motion beyond the trusted band",
+            percent(outside),
+        ),
+        ("could have run faster by", NOTHING if factor is None else f"{plain(factor)} ×"),
+        ("the limit that binds then", str(prediction.get("binding") or NOTHING)),
+        ("limits not evaluated", ", ".join(prediction.get("not_evaluated") or ()) or NOTHING),
+        (
+            "discretisation, peak to valley",
+            quantity(part(summary, "discretisation", "peak_to_valley"), "m"),
+        ),
+    ]
+    return Table("The motion", (), [row for row in rows if row[1] != NOTHING])
+
+
+def sample_table(summary: Mapping[str, object]) -> Table:
+    """Return where every sample of every stream went."""
+    streams: Mapping[str, Any] = part(summary, "samples") or {}
+    reasons = dict.fromkeys(r for s in streams.values() for r in part(s, "counted") or {})
+    rows = [("received", *(count(part(s, "received")) for s in streams.values()))]
+    rows.append(("corrected", *(count(part(s, "corrected")) for s in streams.values())))
+    for reason in reasons:
+        cells = (count((part(s, "counted") or {}).get(reason, 0)) for s in streams.values())
+        rows.append((reason.replace("_", " "), *cells))
+    if any(part(s, "pending") for s in streams.values()):
+        rows.append(("still pending", *(count(part(s, "pending")) for s in streams.values())))
+    return Table("Samples", tuple(streams), rows if streams else ())
+
+
+def latency_text(calibration: Calibration) -> str:
+    """Return how much of the lag is latency, and who says so."""
+    try:
+        latency = latency_of(calibration)
+    except CalibrationError:
+        return NOTHING
+    if latency.share is None:
+        return f"not known ({latency.source})"
+    return f"{measured(latency.delay_s, latency.uncertainty_s, 's')} ({latency.source})"
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """Return what was identified and how well."""
+    certificate, dynamics = calibration.certificate, calibration.dynamics
+    gain = measured(calibration.static_gain, certificate.get("static_gain_uncertainty"), digits=6)
+    delay = measured(
+        certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay),
+        certificate.get("low_frequency_delay_uncertainty_s"),
+        "s",
+    )
+    rows = [
+        ("verdict", str(certificate.get("verdict", NOTHING))),
+        ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
+        ("static gain, probe per encoder", gain),
+        ("delay of slow motion", delay),
+        ("of it latency of the probe", latency_text(calibration)),
+        ("chi-square per degree of freedom", plain(certificate.get("chi_square"))),
+        ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
+        ("whiteness of the residual, p", plain(certificate.get("whiteness_p"))),
+        ("its independence of the motion, p", plain(certificate.get("independence_p"))),
+        ("edges used", count(certificate.get("edges"))),
+        ("sample period", quantity(calibration.sample_period, "s")),
+    ]
+    for number, mode in enumerate(dynamics.modes(), start=1):
+        text = f"{quantity(mode.frequency, 'Hz')}, damping {plain(mode.damping)}"
+        rows.append((f"mode {number}", text))
+    rows.append(("identity", calibration.id[:16]))
+    return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
+
+
+def mapping_table(title: str, values: Mapping[str, object]) -> Table:
+    """Return any mapping of JSON values, one row a key."""
+    return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
+
+
+def remarks_table(calibration: Calibration) -> Table:
+    """Return what the identification has to say about its result."""
+    certificate: Mapping[str, Any] = calibration.certificate
+    remarks = [*(certificate.get("reasons") or ()), *(certificate.get("warnings") or ())]
+    return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
+
+
+def _json_text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)

@@ -1,1 +1,0 @@
-"""Bags and files, and the one mapping between messages and records."""

@@ -1,1 +1,0 @@
-"""Recordings of other programs: columns of text, arrays, TDMS channels, fields of ROS topics."""

@@ -1,1 +1,0 @@
-"""Bags as they are written: in place, readable at every moment, repaired where cut."""

@@ -1,0 +1,174 @@
+"""How the part sits on the chuck: six degrees of freedom from where it should."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.record_checks import check_numbers, is_default
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
+
+# Each turn of the iteration leaves tilt times slope, at most a hundredth, of the error before;
+# it ends when what is left is beyond rounding of a millimetre [m].
+_MOST_ITERATIONS = 8
+_SETTLED_M = 1e-13
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PartPose:
+    """How the part sits on the chuck, from where it should.
+
+    x_m, y_m, z_m: shift of its origin
+    tilt_x_rad, tilt_y_rad: rotation about x and about y;  clocking_rad: about the spindle
+    """
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    clocking_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+    @property
+    def rotation(self) -> FloatArray:
+        """From the part's frame to the chuck's (3, 3): about x, then y, then z."""
+        (sx, sy, sz), (cx, cy, cz) = (
+            f(np.array([self.tilt_x_rad, self.tilt_y_rad, self.clocking_rad]))
+            for f in (np.sin, np.cos)
+        )
+        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+        return np.asarray(about_z @ about_y @ about_x, np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class PosedSurface:
+    """``surface`` in the pose that it has on the chuck; heights are along the spindle."""
+
+    surface: Surface
+    pose: PartPose
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m] of the chuck, of their broadcast shape."""
+        pose, turn = self.pose, self.pose.rotation
+        across, along = np.asarray(x) - pose.x_m, np.asarray(y) - pose.y_m
+        z = np.zeros(np.broadcast(across, along).shape)
+        for _ in range(_MOST_ITERATIONS):
+            # In the part's frame: p = Rᵀ (q - shift).
+            px, py, pz = (
+                turn[0, i] * across + turn[1, i] * along + turn[2, i] * z for i in range(3)
+            )
+            change = (self.surface.height(px, py) - pz) / turn[2, 2]
+            z = z + change
+            if np.all(abs(change) < _SETTLED_M):
+                break
+        return np.asarray(z + pose.z_m, np.float64)
+
+
+def posed(surface: Surface, pose: PartPose) -> Surface:
+    """Return ``surface`` on the chuck; itself where it sits as it should."""
+    return surface if is_default(pose) else PosedSurface(surface, pose)
+
+
+# What a turned mirror really looks like: its nominal shape and a figure error on top.
+#
+# Closed-form and smooth: primary astigmatism (the grip of the chuck), trefoil (three-point
+# mounting) and concentric ripple (the slow-tool servo), each oriented by the seed. Tool marks, if
+# there are any, are the scallops that a round tool leaves turn by turn.
+
+
+@dataclass(frozen=True, slots=True)
+class FigureError:
+    """A surface: ``nominal`` plus a seeded figure error.
+
+    radius: of the aperture [m], where astigmatism and trefoil reach their full size
+    seed: of the orientations of astigmatism and trefoil
+    astigmatism, trefoil, ripple: peak to valley of each part over the aperture [m]
+    ripple_pitch: from crest to crest of the rings [m]
+    tool_marks: peak to valley of the scallops [m];  tool_feed: from one to the next [m]
+    """
+
+    nominal: Surface
+    radius: float
+    seed: int = 1
+    astigmatism: float = 80 * NANOMETRE_M
+    trefoil: float = 40 * NANOMETRE_M
+    ripple: float = 8 * NANOMETRE_M
+    ripple_pitch: float = 1.6 * MILLIMETRE_M
+    tool_marks: float = 0.0
+    tool_feed: float = 15 * MICROMETRE_M
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "ripple_pitch", "tool_feed"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigurationError(
+                    f"figure error: {name} is {value!r} m, expected a positive number"
+                )
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m], of their broadcast shape."""
+        return self.nominal.height(x, y) + self.error(x, y)
+
+    def error(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height above the nominal surface [m] at x, y [m], of their broadcast shape."""
+        radius, angle = np.hypot(x, y), np.arctan2(y, x)
+        rho = radius / self.radius
+        first, second = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, 2)
+        # The even cosine keeps the rings smooth at the centre.
+        error = np.asarray(
+            self.astigmatism / 2 * rho**2 * np.cos(2 * angle - first)
+            + self.trefoil / 2 * rho**3 * np.cos(3 * angle - second)
+            + self.ripple / 2 * np.cos(2 * np.pi * radius / self.ripple_pitch),
+            np.float64,
+        )
+        return error + self.scallops(radius) if self.tool_marks else error
+
+    def scallops(self, radius: FloatArray) -> FloatArray:
+        """Return the height of tool marks [m] at ``radius`` [m]: a parabola from cusp to cusp."""
+        turn = radius / self.tool_feed
+        return np.asarray(self.tool_marks * 4 * (turn - np.rint(turn)) ** 2, np.float64)
+
+
+# Marks of a tool that moved outward: a circle crosses one every wavelength.
+
+
+@dataclass(frozen=True, slots=True)
+class Spokes:
+    """A surface: ``nominal`` plus waves across every circle about the spindle axis.
+
+    wavelength: along the circle of ``radius`` [m], rounded to a whole number a turn
+    rms: of the first wave [m];  second: of the second harmonic, as a share of the first
+    """
+
+    nominal: Surface
+    radius: float
+    wavelength: float = 15 * MICROMETRE_M
+    rms: float = 11 * NANOMETRE_M
+    second: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "wavelength"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(
+                    f"spokes: {name} is {getattr(self, name)!r} m, expected a positive number"
+                )
+
+    @property
+    def count(self) -> int:
+        """Waves a turn."""
+        return max(round(2 * np.pi * self.radius / self.wavelength), 1)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m], of their broadcast shape."""
+        phase = self.count * np.arctan2(y, x)
+        waves = np.cos(phase) + self.second * np.cos(2 * phase)
+        return np.asarray(self.nominal.height(x, y) + 2**0.5 * self.rms * waves, np.float64)

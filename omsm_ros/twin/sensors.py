@@ -1,0 +1,270 @@
+"""The channels beside encoder and probe: a reference sensor and an accelerometer.
+
+Not imitated: their anti-alias filters, saturation of the accelerometer, ground loops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import AccelerationBlock, DistanceBlock, FloatArray, Status
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.record_checks import check_numbers, is_default
+from omsm_ros.twin.trajectory import Trajectory
+from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
+
+# No accelerometer has content beyond 100 kHz.
+_SHORTEST_PERIOD_S = 5e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferenceSensor:
+    """A capacitive sensor on the carriage's own motion, as a CPL190 has it (250 µm).
+
+    latency_s: how late it reads;  scale_ppm: it reads so much too long
+    noise_m: standard deviation;  half_range_m: beyond it there is no reading
+    cubic_m: error of linearity at the end of its range
+    """
+
+    latency_s: float = 0.0
+    scale_ppm: float = 0.0
+    noise_m: float = 2 * NANOMETRE_M
+    half_range_m: float = 125 * MICROMETRE_M
+    cubic_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            positive=("half_range_m",),
+            not_negative=("latency_s", "noise_m"),
+            lags=("latency_s",),
+        )
+
+    def read(
+        self, carriage: Trajectory, time: FloatArray, period: float, random: np.random.Generator
+    ) -> DistanceBlock:
+        """Return what it reports of the carriage for the triggers at ``time`` (n,) [s]."""
+        z = carriage.at(time - self.latency_s)
+        said = z * (1 + self.scale_ppm * PPM) + self.cubic_m * (z / self.half_range_m) ** 3
+        in_range = abs(z) <= self.half_range_m
+        noisy = said + random.normal(0.0, self.noise_m, len(z))
+        return DistanceBlock(
+            stamp_ns=0,
+            first_sample=0,
+            sample_period=period,
+            distance=np.where(in_range, noisy, np.nan),
+            status=np.where(in_range, Status.OK, Status.OUT_OF_RANGE).astype(np.uint8),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accelerometer:
+    """A piezoelectric accelerometer on the probe, as a PCB 356A17.
+
+    sample_period_s: its own, None for the trigger's
+    noise_m_per_s2: standard deviation of a sample, each axis
+    high_pass_hz: it sees nothing at rest;  scale_ppm: it reads so much too much
+    cross_talk: part of z that x and y show [1]
+    """
+
+    sample_period_s: float | None = None
+    noise_m_per_s2: float = 6e-4
+    high_pass_hz: float = 0.5
+    scale_ppm: float = 0.0
+    cross_talk: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            self, positive=("sample_period_s", "high_pass_hz"), not_negative=("noise_m_per_s2",)
+        )
+        if self.sample_period_s is not None and self.sample_period_s < _SHORTEST_PERIOD_S:
+            raise ConfigurationError(
+                f"Accelerometer: sample_period_s is {self.sample_period_s!r}, expected "
+                f"{_SHORTEST_PERIOD_S:g} or more"
+            )
+
+    def read(
+        self,
+        acceleration: FloatArray,
+        period: float,
+        random: np.random.Generator,
+    ) -> AccelerationBlock:
+        """Return what it reports of the probe's ``acceleration`` (n,), every ``period`` [s]."""
+        z = self._high_passed(acceleration, period) * (1 + self.scale_ppm * PPM)
+        noise = random.normal(0.0, self.noise_m_per_s2, (3, len(z)))
+        return AccelerationBlock(
+            stamp_ns=0,
+            first_sample=0,
+            sample_period=period,
+            x=self.cross_talk * z + noise[0],
+            y=self.cross_talk * z + noise[1],
+            z=z + noise[2],
+        )
+
+    def _high_passed(self, values: FloatArray, period: float) -> FloatArray:
+        tau = 1 / (2 * np.pi * self.high_pass_hz)
+        b, a, _ = signal.cont2discrete(([tau, 0.0], [tau, 1.0]), period, method="bilinear")
+        return np.asarray(signal.lfilter(b.ravel(), a, values))
+
+
+def acceleration_of(motion: Trajectory) -> Trajectory:
+    """Return the second derivative of a motion [m/s²]; 0.1 % low at a fiftieth of its rate."""
+    second = np.diff(motion.values, 2) / motion.step**2
+    return Trajectory(motion.start + motion.step, motion.step, second)
+
+
+# When each device takes its sample, against the instant that the trigger count stands for.
+#
+# Not imitated: a counter that slips (see the emulators' faults), stamps of the computer.
+
+# No draw of a normal distribution lies beyond this many sigma in a billion.
+_JITTER_LIMIT = 7.0
+
+
+class Instants(NamedTuple):
+    """When the trigger, the encoders of Z and C, and the probe take their samples [s], (n,)."""
+
+    trigger: FloatArray
+    z: FloatArray
+    c: FloatArray
+    probe: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockErrors:
+    """Times that are not what the trigger count says; nothing by default.
+
+    trigger_jitter_s: rms, of all devices together;  probe_jitter_s: rms, of the probe alone
+    probe_offset_s: the probe takes each sample so much later than its count says
+    probe_drift_ppm: and its clock is so much slower, so that it falls behind
+    z_latch_late_s, c_latch_late_s: the encoder is latched so much after the trigger
+    """
+
+    trigger_jitter_s: float = 0.0
+    probe_jitter_s: float = 0.0
+    probe_offset_s: float = 0.0
+    probe_drift_ppm: float = 0.0
+    z_latch_late_s: float = 0.0
+    c_latch_late_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        jitter = ("trigger_jitter_s", "probe_jitter_s")
+        late = ("probe_offset_s", "z_latch_late_s", "c_latch_late_s")
+        check_numbers(self, not_negative=jitter, lags=(*jitter, *late))
+
+    @property
+    def lag_s(self) -> float:
+        """How much later than the reading the encoder of Z was looked at, at the start."""
+        return self.z_latch_late_s - self.probe_offset_s
+
+    def reach_s(self, duration: float) -> float:
+        """Return how far a sample is taken from its nominal instant at most [s]."""
+        jitter = _JITTER_LIMIT * (self.trigger_jitter_s + self.probe_jitter_s)
+        late = max(abs(self.z_latch_late_s), abs(self.c_latch_late_s), abs(self.probe_offset_s))
+        return jitter + late + abs(self.probe_drift_ppm) * PPM * duration
+
+    def instants(self, time: FloatArray, random: np.random.Generator) -> Instants:
+        """Return the instants of all devices for nominal ones ``time`` (n,) [s]."""
+        if is_default(self):
+            return Instants(time, time, time, time)
+        together, alone = np.clip(random.normal(size=(2, len(time))), -_JITTER_LIMIT, _JITTER_LIMIT)
+        trigger = time + self.trigger_jitter_s * together
+        probe = trigger + self.probe_jitter_s * alone + self.probe_offset_s
+        return Instants(
+            trigger=trigger,
+            z=trigger + self.z_latch_late_s,
+            c=trigger + self.c_latch_late_s,
+            probe=probe + self.probe_drift_ppm * PPM * time,
+        )
+
+
+# What the encoder of Z makes of the carriage's motion.
+#
+# Not imitated: errors of the encoders of X, Y, B and C, count loss, a scale that bends.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pitch:
+    """The carriage pitches, and the encoder, ``arm_m`` beside the probe's line, sees ``E = L α``.
+
+    rad_per_m: steady bend of the way;  periodic_rad, period_m: of its rollers or screw
+    rad_per_m_s2: pitch under acceleration, through a mode of frequency_hz and damping_ratio
+    """
+
+    arm_m: float
+    rad_per_m: float = 0.0
+    periodic_rad: float = 0.0
+    period_m: float = 1e-3
+    rad_per_m_s2: float = 0.0
+    frequency_hz: float = 60.0
+    damping_ratio: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("period_m", "frequency_hz", "damping_ratio"))
+
+    @property
+    def _mode(self) -> tuple[list[float], list[float]]:
+        omega = 2 * np.pi * self.frequency_hz
+        ratio = [1.0, 2 * self.damping_ratio * omega, omega**2]
+        return [self.rad_per_m_s2 * omega**2, 0.0, 0.0], ratio
+
+    def angle(self, carriage: Trajectory) -> FloatArray:
+        """Return the pitch α [rad] along the carriage's motion, (n,)."""
+        z = carriage.values
+        steady = self.rad_per_m * z + self.periodic_rad * np.sin(2 * np.pi * z / self.period_m)
+        if not self.rad_per_m_s2:
+            return np.asarray(steady, np.float64)
+        numerator, denominator, _ = signal.cont2discrete(self._mode, carriage.step, method="foh")
+        return np.asarray(steady + signal.lfilter(numerator.ravel(), denominator, z - z[0]))
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """Return ``E / X_d`` at ``s`` [rad/s], without the periodic part."""
+        numerator, denominator = self._mode
+        dynamic = np.polyval(numerator, s) / np.polyval(denominator, s)
+        return np.asarray(self.arm_m * (self.rad_per_m + dynamic), np.complex128)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderErrors:
+    """Of the encoder of Z; nothing by default.
+
+    scale_ppm: reads so much too long
+    interpolation_m, signal_period_m: ``interpolation_m · sin(2π z / signal_period_m)``
+    resolution_m: of its counts, 0 for none
+    pitch: it sees another motion than the probe
+    """
+
+    scale_ppm: float = 0.0
+    interpolation_m: float = 0.0
+    signal_period_m: float = 4e-6
+    resolution_m: float = 0.0
+    pitch: Pitch | None = None
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("signal_period_m",), not_negative=("resolution_m",))
+
+    def seen(self, carriage: Trajectory) -> Trajectory:
+        """Return the position under the encoder [m], before its own errors."""
+        if self.pitch is None:
+            return carriage
+        values = carriage.values + self.pitch.arm_m * self.pitch.angle(carriage)
+        return Trajectory(carriage.start, carriage.step, values)
+
+    def read(self, position: FloatArray, noise: FloatArray) -> FloatArray:
+        """Return what it says at ``position`` (n,) [m], with ``noise`` (n,) [m]."""
+        if is_default(self):
+            return position + noise
+        wave = self.interpolation_m * np.sin(2 * np.pi * position / self.signal_period_m)
+        said = position * (1 + self.scale_ppm * PPM) + wave + noise
+        step = self.resolution_m
+        return np.asarray(np.round(said / step) * step if step else said, np.float64)
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """Return reading over motion of the carriage at ``s`` [rad/s], its linear part."""
+        pitch = self.pitch.response(s) if self.pitch else np.zeros_like(s)
+        return np.asarray((1 + self.scale_ppm * PPM) * (1 + pitch), np.complex128)

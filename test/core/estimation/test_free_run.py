@@ -1,0 +1,137 @@
+"""A model runs over another record: against the system that made it, in every hold."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from omsm_ros.core.estimation.sampled_model import (
+    BAND_LIMITED,
+    Discrete,
+    SampledModel,
+    free_run,
+    resting_output,
+)
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.errors import IdentificationError
+
+PERIOD = 0.01
+TRUTH = TransferFunction.from_ascending([2.0, 0.05], [1.0, 0.05, 0.02])
+TIME = PERIOD * np.arange(2000)
+NOISE = 1e-3
+
+
+def held(delay=0):
+    b, a, _ = signal.cont2discrete((TRUTH.numerator[::-1], TRUTH.denominator[::-1]), PERIOD)
+    discrete = Discrete(
+        numerator=np.ravel(b), denominator=a, delay=delay, covariance=1e-12 * np.eye(5)
+    )
+    return model(discrete=discrete)
+
+
+def smooth():
+    return model(hold=BAND_LIMITED, continuous=TRUTH, covariance=1e-12 * np.eye(6))
+
+
+def model(**parts):
+    nothing = dict.fromkeys(("discrete", "continuous", "covariance"))
+    return SampledModel(
+        **{"hold": "zero-order", **nothing, **parts},
+        sample_period=PERIOD,
+        valid_from=0.01,
+        valid_up_to=10.0,
+        working_point=(4.0, 30.0),
+    )
+
+
+def moving(lead=5.0):
+    """A smooth input whose record begins ``lead`` seconds after it was at rest."""
+    # Ten times as fine: between its samples the simulation runs straight.
+    time = PERIOD / 10 * np.arange(10 * (2000 + round(lead / PERIOD)))
+    u = 4.0 + np.sin(2 * np.pi * 0.7 * time) * (1 - np.exp(-time))
+    _, y, _ = signal.lsim((TRUTH.numerator[::-1], TRUTH.denominator[::-1]), u - 4.0, time)
+    return u[::10][-2000:], y[::10][-2000:] + 30.0
+
+
+def test_a_record_that_begins_in_motion_is_followed_to_the_noise():
+    u, y = moving()
+    noisy = y + np.random.default_rng(1).normal(0, NOISE, 2000)
+    run = free_run(smooth(), u, noisy)
+    assert run.rms == pytest.approx(NOISE, rel=0.05)
+    assert np.max(np.abs(run.output - y)) < NOISE
+    assert run.explained == pytest.approx(1 - NOISE**2 / np.var(noisy), abs=1e-7)
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_held_input_with_its_delay(delay):
+    rng = np.random.default_rng(2)
+    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    _, a = np.ravel(held().discrete.numerator), held().discrete.denominator
+    late = np.concatenate([np.zeros(delay), u - 4.0])[:2000]
+    y = 30.0 + signal.lfilter(held().discrete.numerator, a, late)
+    assert free_run(held(delay), u, y).rms < 1e-9
+    assert free_run(held(delay + 1), u, y).rms > 0.02
+
+
+def test_a_wrong_model_does_not_account_for_the_record():
+    u, y = moving()
+    slower = replace(smooth(), continuous=TransferFunction.from_ascending([2.0], [1.0, 0.3]))
+    run = free_run(slower, u, y)
+    assert run.explained < 0.9
+    assert run.rms**2 == pytest.approx((1 - run.explained) * np.var(y))
+
+
+def test_what_does_not_count_changes_nothing():
+    u, y = moving()
+    used = np.ones(2000, bool)
+    used[300:320] = False
+    spoiled = np.where(used, y, 1e6)
+    run = free_run(smooth(), u, spoiled, used)
+    assert np.all(np.isnan(run.residual[~used]))
+    assert run.rms < 1e-3
+    assert np.max(np.abs(run.output - y)) < 1e-3
+    assert free_run(smooth(), u, np.where(used, y, np.nan)).rms == pytest.approx(run.rms)
+
+
+def test_the_output_that_rests_where_the_input_has_its_mean():
+    u, y = moving()
+    found = resting_output(held().discrete, u, y, np.ones(2000, bool))
+    assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 4.0), abs=2e-2)
+
+
+@pytest.mark.parametrize("samples", [0, 49])
+def test_too_short_a_record_is_refused(samples):
+    with pytest.raises(IdentificationError, match="at least 50"):
+        free_run(held(), np.zeros(samples), np.zeros(samples))
+
+
+def test_what_moved_within_the_delay_before_the_record_is_a_state_too():
+    """Cut from a longer record: the first samples answer to inputs that the cut has not."""
+    rng = np.random.default_rng(3)
+    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    discrete = held().discrete
+    late = np.concatenate([np.zeros(7), u - 4.0])[:2000]
+    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, late)
+    assert free_run(held(7), u[503:], y[503:]).rms < 1e-9
+
+
+def test_the_resting_output_of_a_single_step():
+    u = np.where(np.arange(2000) < 400, 3.0, 5.0)
+    discrete = held().discrete
+    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, u - 3.0)
+    found = resting_output(discrete, u, y, np.ones(2000, bool))
+    assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 3.0), abs=1e-6)
+
+
+def test_the_least_record_is_enough():
+    u, y = moving()
+    assert free_run(smooth(), u[:50], y[:50]).rms < 1e-3
+
+
+@pytest.mark.parametrize("still", ["input", "output"])
+def test_of_a_record_that_stands_still_nothing_is_accounted_for(still):
+    """A constant output is matched to the last digit by any model and the constant fitted to it."""
+    columns = {"input": np.sin(TIME), "output": np.sin(TIME), still: np.ones(len(TIME))}
+    with pytest.raises(IdentificationError, match=f"the {still} changes by 0 in all"):
+        free_run(held(), **columns)

@@ -1,0 +1,239 @@
+"""Which structures are tried, and which is chosen, on steps through systems of known order."""
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.estimation.model_order import (
+    Candidate,
+    StartingPoints,
+    cancels,
+    choose,
+    explore,
+    held_out_rms,
+    identifiable,
+    information,
+    structures,
+)
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.errors import IdentificationError
+from omsm_ros.twin.plant import Plant, respond
+
+NOISE = 1e-8
+FIRST_ORDER = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
+OMEGA = 2 * np.pi * 40.0
+PAIR = TransferFunction.from_ascending([1.0], [1.0, 0.2 / OMEGA, OMEGA**-2])
+PAIR_AND_POLE = TransferFunction.from_ascending(
+    [1.0], np.polynomial.polynomial.polymul([1.0, 0.2 / OMEGA, OMEGA**-2], [1.0, 8e-3])
+)
+
+
+@lru_cache(maxsize=8)
+def problem_of(dynamics, seed=1):
+    motion = StepTest(count=2, dwell=0.3)
+    moved = respond(Plant(dynamics), motion, round(motion.duration / 1e-3), 1e-3)
+    n = len(moved.probe)
+    seen = moved.probe + np.random.default_rng(seed).normal(0.0, NOISE, n)
+    return Problem(moved.carriage, seen, np.ones(n, bool), 1e-3, np.ones((n, 1)), 300.0)
+
+
+def fitter(problem):
+    """How one structure is fitted to ``problem``, given the smaller ones."""
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    points = StartingPoints(problem, lag)
+    return lambda structure, smaller: fit(problem, structure, points.of(structure, smaller))
+
+
+@lru_cache(maxsize=8)
+def explored(dynamics, order=0):
+    return explore(fitter(problem_of(dynamics)), order)
+
+
+def best(candidates):
+    return min(candidates, key=lambda c: c.bic)
+
+
+def distance(found, truth):
+    """Greatest relative difference of the responses up to 60 Hz."""
+    frequency = np.linspace(0.5, 60.0, 50)
+    return np.max(np.abs(found.response(frequency) / truth.response(frequency) - 1))
+
+
+def test_there_are_always_fewer_zeros_than_poles():
+    for poles in range(1, 7):
+        assert all(s.zeros < s.poles == poles for s in structures(poles))
+    assert structures(0) == [Structure(0, 0, True)]
+
+
+def test_a_structure_has_one_or_two_zeros_fewer_and_a_delay_or_none_the_smallest_first():
+    for poles in range(2, 7):
+        tried = structures(poles)
+        assert {(s.zeros, s.delay) for s in tried} == {
+            (zeros, delay) for zeros in (poles - 2, poles - 1) for delay in (False, True)
+        }
+        assert len(tried) == 4
+        assert [s.size for s in tried] == sorted(s.size for s in tried)
+
+
+def test_no_order_is_begun_once_enough_was_tried():
+    spent = Effort(comparisons=10**6)
+    to = [
+        max(c.fit.structure.poles for c in explore(fitter(problem_of(PAIR)), order, effort=spent))
+        for order in (0, 3)
+    ]
+    assert to == [0, 3]
+    assert max(c.fit.structure.poles for c in explored(PAIR)) > 0
+
+
+@pytest.mark.parametrize("order", [-1, 21, 1000])
+def test_an_order_that_no_polynomial_has_digits_for_is_refused(order):
+    with pytest.raises(IdentificationError, match=r"expected 0 \(choose\) to 20"):
+        explore(fitter(problem_of(FIRST_ORDER)), order)
+
+
+def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
+    """Of normal residuals with their own variance, but for a constant of n."""
+    small, *_, large = (c.fit for c in explored(PAIR))
+    n = small.samples
+    assert small.size < large.size
+
+    def likelihood(found):
+        variance = np.mean(found.residual**2)
+        density = -(found.residual**2) / (2 * variance) - 0.5 * np.log(2 * np.pi * variance)
+        return float(np.sum(density))
+
+    expected = 2 * (likelihood(small) - likelihood(large))
+    expected += (large.size - small.size) * math.log(n)
+    assert information(large) - information(small) == pytest.approx(expected, rel=1e-9)
+    dearer = information(large, 2.5) - information(small, 2.5)
+    charge = 1.5 * (large.size - small.size) * math.log(n)
+    assert dearer == pytest.approx(expected + charge, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "damping", "told"),
+    [
+        (50.0, 0.01, True),
+        (50.0, 1e-4, False),  # decays to 1/e in 32 s, the record takes ten
+        (700.0, 0.05, False),  # rings beyond 500 Hz
+        (700.0, 0.5, True),
+        (7e6, 1.0, True),  # too fast to be seen, and harmless
+    ],
+)
+def test_a_pole_is_told_by_samples_it_shows_in(frequency, damping, told):
+    omega = 2 * np.pi * frequency
+    pair = TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
+    assert identifiable(pair, 1e-3, 10.0) is told
+
+
+@pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])
+def test_the_data_insist_on_as_many_poles_as_there_are(truth, poles):
+    smallest = best(explored(truth)).fit
+    assert smallest.structure.poles == poles
+    assert distance(smallest.dynamics, truth) < 0.01
+
+
+@pytest.mark.parametrize("zeros", [[1.0, 2e-3], [1.0, 4e-4, (2 * np.pi * 90.0) ** -2]])
+def test_the_data_insist_on_zeros_and_delay_too(zeros):
+    """The largest structure of three poles, and the one that is tried last below it."""
+    truth = TransferFunction(zeros, PAIR_AND_POLE.denominator, delay=1.7e-3)
+    smallest = best(explored(truth)).fit
+    assert smallest.structure == Structure(3, len(zeros) - 1, True)
+    assert distance(smallest.dynamics, truth) < 0.01
+
+
+@pytest.mark.parametrize("truth", [FIRST_ORDER, PAIR, PAIR_AND_POLE])
+def test_the_chosen_one_contains_the_smallest_and_is_richer(truth):
+    candidates = explored(truth)
+    smallest = best(candidates).fit.structure
+    chosen = choose(candidates)
+    assert chosen.fit.structure.contains(smallest)
+    assert chosen.fit.structure.size == max(smallest.size + 1, 3)
+    assert distance(chosen.fit.dynamics, truth) < 0.01
+
+
+def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only():
+    problem = problem_of(PAIR)
+    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
+    by_poles = {c.fit.structure.poles: c.fit for c in explored(PAIR)}
+    assert held_out_rms(problem, by_poles[2], held) == pytest.approx(NOISE, rel=0.1)
+    assert held_out_rms(problem, by_poles[0], held) > 10 * NOISE
+    assert math.isnan(held_out_rms(problem, by_poles[2], np.zeros(len(held), bool)))
+    assert math.isnan(held_out_rms(problem, by_poles[2], np.ones(len(held), bool)))
+
+
+def test_what_was_held_out_did_not_teach_the_model():
+    """Of other values where it is held out, the same structure misses just those."""
+    problem = problem_of(PAIR)
+    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
+    shifted = replace(problem, output=problem.output + np.where(held, 1e-6, 0.0))
+    found = best(explored(PAIR)).fit
+    assert held_out_rms(shifted, found, held) == pytest.approx(1e-6, rel=0.01)
+
+
+def test_a_zero_on_a_pole_is_no_richer():
+    """A richer candidate is passed over once its zero cancels a pole."""
+    candidates = explored(FIRST_ORDER)
+    chosen = choose(candidates)
+    scaled = chosen.fit.scaled
+    dipole = TransferFunction([1.0, 1.0001e-2], [1.0, 1.1e-2, 1e-5])
+    assert cancels(dipole)
+
+    class Cancelling(type(chosen.fit)):
+        dynamics = dipole
+
+    spoiled = Cancelling(
+        scaled, chosen.fit.nonlinear, chosen.fit.driven, chosen.fit.background, chosen.fit.residual
+    )
+    others = [Candidate(spoiled, c.bic) if c.fit is chosen.fit else c for c in candidates]
+    again = choose(others)
+    assert again.fit is not spoiled
+
+
+@pytest.mark.parametrize(("apart", "cancelling"), [(1e-4, True), (0.05, False)])
+def test_a_zero_cancels_a_pole_that_no_data_could_tell_from_it(apart, cancelling):
+    """Of either pole, wherever the other one lies."""
+    for pole, other in ((100.0, 1e4), (1e4, 100.0)):
+        poles = np.polynomial.polynomial.polymul([1.0, 1 / pole], [1.0, 1 / other])
+        zero = [1.0, 1 / (pole * (1 + apart))]
+        assert cancels(TransferFunction(np.array(zero), poles)) is cancelling
+
+
+def test_where_there_are_no_zeros_none_cancels():
+    assert not cancels(TransferFunction([1.0], [1.0, 1.1e-2, 1e-5]))
+
+
+@pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])
+def test_the_search_stops_two_poles_after_the_last_gain(truth, poles):
+    assert max(c.fit.structure.poles for c in explored(truth)) == poles + 2
+
+
+def test_the_search_goes_as_far_as_the_order_asked_for_and_tries_all_below():
+    tried = explored(FIRST_ORDER, 5)
+    assert {c.fit.structure.poles for c in tried} == {0, 1, 2, 3, 4, 5}
+    assert best(tried).fit.structure == best(explored(FIRST_ORDER)).fit.structure
+
+
+def test_hopeless_structures_are_not_fitted():
+    """Of four poles and more the largest structure gains nothing; so none of them can."""
+    tried = explored(FIRST_ORDER, 4)
+    assert sum(c.fit.structure.poles == 4 for c in tried) == 1
+
+
+def test_of_the_structures_fitted_none_that_could_win_is_left_out():
+    """Against fitting every structure there is."""
+    problem = problem_of(PAIR_AND_POLE)
+    fit_structure = fitter(problem)
+    every = []
+    for poles in range(5):
+        for structure in structures(poles):
+            every.append(fit_structure(structure, list(every)))
+    least = min(every, key=information)
+    assert best(explored(PAIR_AND_POLE)).fit.structure == least.structure

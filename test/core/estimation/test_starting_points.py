@@ -1,0 +1,127 @@
+"""Places to start from, judged by how near they come to the answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.estimation.model_order import StartingPoints, coarser
+from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.lti.transfer_function import TransferFunction
+
+PERIOD = 1e-3
+
+
+def points_for(dynamics, finer=1, lost=()):
+    """Four seconds; ``finer``: times as many samples."""
+    time = np.arange(4000 * finer) * (PERIOD / finer)
+    motion = sum(1e-5 * np.exp(-(((time - c) / 4e-3) ** 2)) for c in np.arange(0.4, 3.6, 0.37))
+    frequency = np.fft.rfftfreq(len(motion), PERIOD / finer)
+    seen = np.fft.irfft(np.fft.rfft(motion) * dynamics.response(frequency), len(motion))
+    seen = seen + np.random.default_rng(1).normal(0, 1e-9, len(motion))
+    used = np.ones(len(motion), bool)
+    used[list(lost)] = False
+    seen[~used] = 0.0
+    background = np.ones((len(motion), 1))
+    problem = Problem(motion, seen, used, PERIOD / finer, background, 300.0)
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    return StartingPoints(problem, lag)
+
+
+def resonance(frequency, damping):
+    omega = 2 * np.pi * frequency
+    return TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
+
+
+def frequencies_of(points, structure, shapes):
+    scaled = Scaled(structure, points.problem.rate)
+    return [scaled.transfer_function(s, np.ones(1)).modes()[0].frequency for s in shapes]
+
+
+@pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.02), (80.0, 0.05), (140.0, 0.01)])
+def test_linear_least_squares_finds_a_resonance_no_guess_would(frequency, damping):
+    points = points_for(resonance(frequency, damping))
+    structure = Structure(2, 0, False)
+    found = frequencies_of(points, structure, points.of(structure, []))
+    assert min(abs(f / frequency - 1) for f in found) < 0.01
+
+
+def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():
+    points = points_for(resonance(60.0, 0.1))
+    fits = []
+    for structure in (Structure(1, 0, False), Structure(2, 0, False), Structure(3, 1, False)):
+        fits.append(fit(points.problem, structure, points.of(structure, fits)))
+    costs = [f.sum_of_squares for f in fits]
+    assert costs[0] >= costs[1] * 0.999
+    assert costs[1] >= costs[2] * 0.999
+
+
+def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
+    points = points_for(resonance(60.0, 0.1))
+    for structure in (Structure(4, 3, True), Structure(3, 2, False), Structure(0, 0, True)):
+        scaled = Scaled(structure, points.problem.rate)
+        for shape in points.of(structure, []):
+            assert len(shape) == scaled.nonlinear_size
+            assert scaled.transfer_function(shape, np.ones(1)).is_stable
+
+
+@pytest.mark.parametrize("lost", [(), range(5, 48_000, 7), range(9000, 9400)], ids=str)
+@pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.1), (140.0, 0.02)])
+def test_many_samples_start_where_fewer_of_them_lead(frequency, damping, lost):
+    points = points_for(resonance(frequency, damping), finer=12, lost=lost)
+    structure = Structure(2, 0, False)
+    (start,) = points.of(structure, [])
+    assert frequencies_of(points, structure, [start]) == pytest.approx([frequency], rel=1e-3)
+    before = points.problem.effort.comparisons
+    found = fit(points.problem, structure, [start])
+    assert points.problem.effort.comparisons - before < 12
+    lines = np.array([5.0, 20.0, 60.0])
+    truth = resonance(frequency, damping).response(lines)
+    np.testing.assert_allclose(found.dynamics.response(lines), truth, rtol=1e-4)
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_a_coarser_problem_has_the_same_response(every):
+    """Of a plant and a motion whose spectra are known, to what noise leaves."""
+    truth = TransferFunction.from_ascending([1.0, 2e-3], [1.0, 6e-3, 2e-5], 1e-3)
+    problem = points_for(truth, finer=4).problem
+    coarse = coarser(problem, every)
+    assert coarse.period == pytest.approx(every * problem.period)
+    assert len(coarse.input) == len(coarse.output) == len(coarse.used) == len(coarse.background)
+    structure = Structure(2, 1, True)
+    start = Scaled(structure, problem.rate).nonlinear_of(np.array([-1.0, -2.0], complex), 0.3)
+    found = fit(coarse, structure, [start]).dynamics
+    lines = np.geomspace(1.0, 60.0, 8)
+    np.testing.assert_allclose(found.response(lines), truth.response(lines), rtol=1e-3)
+
+
+def test_what_is_beyond_the_new_half_rate_folds_nowhere():
+    problem = points_for(resonance(60.0, 0.1)).problem
+    time = np.arange(len(problem.input)) * PERIOD
+    beyond = replace(problem, output=np.sin(2 * np.pi * 140.0 * time))
+    inside = replace(problem, output=np.sin(2 * np.pi * 90.0 * time))
+    at_rest = slice(50, -50)
+    assert np.max(abs(coarser(beyond, 4).output[at_rest])) < 1e-4
+    assert np.max(abs(coarser(inside, 4).output[at_rest])) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("offset", range(3))
+def test_readings_rarer_than_the_samples_of_the_axis_are_seen_in_fewer_samples(offset):
+    """Every third sample holds a reading: those of the coarser problem may all lie between."""
+    problem = points_for(resonance(30.0, 0.3), finer=3).problem
+    rare = np.zeros(len(problem.used), bool)
+    rare[offset::3] = True
+    fewer = coarser(replace(problem, used=rare, output=np.where(rare, problem.output, 0.0)), 3)
+    whole = coarser(problem, 3)
+    assert np.mean(fewer.used) > 0.99
+    error = (fewer.output - whole.output)[fewer.used]
+    assert np.sqrt(np.mean(error**2)) < 3e-3 * np.ptp(whole.output)
+
+
+def test_what_was_lost_for_longer_than_a_new_sample_stays_lost():
+    problem = points_for(resonance(30.0, 0.3), finer=3).problem
+    used = problem.used.copy()
+    used[6000:6100] = used[300] = False
+    fewer = coarser(replace(problem, used=used), 3)
+    assert np.flatnonzero(~fewer.used).tolist() == list(range(2000, 2034))

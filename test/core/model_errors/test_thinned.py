@@ -1,0 +1,87 @@
+"""Departures of a long step test, looked for in fewer samples, against all of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.preparation import prepare
+from omsm_ros.core.estimation.steps import Steps
+from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.model_errors.families import BACKLASH, CREEP, MODE, PERIODIC, relaxed
+from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.streams.motion_record import MotionRecord
+
+PERIOD, LAG = 2e-3, 0.7e-3
+STEPS = StepTest(dwell=4.0, rise=40e-3)
+TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
+LATE = STEPS.positions(TIME - LAG).z
+
+
+def surveyed(added=0.0):
+    random = np.random.default_rng(4)
+    z = STEPS.positions(TIME).z + random.normal(0, 0.3e-9, len(TIME))
+    record = MotionRecord.from_arrays(PERIOD, z, -(LATE + added) + random.normal(0, 1e-8, len(z)))
+    prepared = prepare(record, "encoder")
+    late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
+    return Survey(prepared.problem, late, prepared.steps)
+
+
+@pytest.fixture(scope="module")
+def long():
+    return surveyed()
+
+
+def test_relaxations_are_as_large_and_as_well_known_in_fewer_samples(long):
+    every = zip(long.creep, long.thinned.creep, strict=True)
+    for all_, fewer in every:
+        assert fewer.term.parameter == all_.term.parameter
+        assert fewer.score.uncertainty == pytest.approx(all_.score.uncertainty, rel=0.15)
+        off = (fewer.score.size[0] - all_.score.size[0]) / all_.score.uncertainty
+        assert abs(off) < 0.3
+
+
+def test_the_edges_are_where_they_were_in_time(long):
+    fewer = long.thinned
+    assert len(fewer.problem.input) < 0.6 * len(long.problem.input)
+    for edge, other in zip(long.steps.edges, fewer.steps.edges, strict=True):
+        before = other.start * fewer.problem.period
+        assert before == pytest.approx(edge.start * PERIOD, abs=fewer.problem.period)
+        assert other.height == edge.height
+    assert fewer.plateau == pytest.approx(long.plateau, rel=0.01)
+
+
+@pytest.mark.parametrize("time_constant", [0.1, 3.0])
+def test_the_relaxation_that_is_there_is_the_one_found(time_constant):
+    found = surveyed(2e-3 * (relaxed(LATE, PERIOD / time_constant) - LATE)).best[CREEP]
+    assert found.significant
+    assert abs(np.log(found.term.parameter / time_constant)) < 0.5
+    assert len(found.term.columns) == len(TIME)
+
+
+def test_each_family_has_the_same_terms_there(long):
+    for family in long.departures.families((CREEP, MODE, PERIODIC, BACKLASH)):
+        if len(family.parameters) == 1:
+            continue
+        alike = long.thinned.departures.alike(family)
+        assert (alike.name, alike.width, alike.trials) == (family.name, family.width, family.trials)
+        np.testing.assert_array_equal(alike.parameters, family.parameters)
+        every = round(long.thinned.problem.period / PERIOD)
+        rested = ~np.convolve(long.steps.moving, np.ones(200), "same").astype(bool)[::every]
+        # Where in a gap of 10 nm a motion rests is a matter of its noise.
+        first = len(family.parameters) - 1 if family.name == BACKLASH else 0
+        for index in (first, len(family.parameters) - 1):
+            there, here = alike.term(index).columns, family.term(index).columns[::every]
+            np.testing.assert_allclose(
+                there[rested], here[rested], atol=0.03 * np.max(abs(here)), err_msg=family.name
+            )
+
+
+def test_a_short_one_a_restless_one_and_rounded_readings_are_taken_whole(long, clean):
+    assert clean.thinned is None
+    moving = np.ones(len(TIME), bool)
+    assert replace(long, steps=Steps((), moving, 1e-9, 1e-4)).thinned is None
+    assert replace(long, steps=replace(long.steps, moving=moving)).thinned is None
+    assert replace(long, problem=replace(long.problem, shared=1e-18)).thinned is None

@@ -1,0 +1,44 @@
+"""What would decide what a line is: advice that was followed already helps nobody."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from omsm_ros.core.ripple.ripple_guard import images, to_decide
+from omsm_ros.core.ripple.scan_signal import PATH, TIME
+from omsm_ros.core.ripple.source_hypotheses import PART
+
+VIBRATION = "vibration"
+
+
+def scan(pace, felt=None):
+    coordinates = {TIME: SimpleNamespace(pace=1.0), PATH: SimpleNamespace(pace=pace)}
+    return SimpleNamespace(coordinates=coordinates, felt=felt)
+
+
+LINE = SimpleNamespace(possible=(TIME, PATH))
+
+
+@pytest.mark.parametrize("own", [0, 1])
+@pytest.mark.parametrize(
+    ("paces", "kinds", "first"),
+    [
+        ((0.04,), {PART, VIBRATION}, "a second scan of the part at another speed"),
+        ((0.04, 0.0405), {PART, VIBRATION}, "a second scan of the part at another speed"),
+        ((0.04, 0.08), {PART, VIBRATION}, "a further scan at yet another speed"),
+        ((0.04, 0.08), {VIBRATION}, "a slower scan that resolves finer texture"),
+    ],
+)
+def test_the_scan_that_is_asked_for_is_one_that_is_not_there(own, paces, kinds, first):
+    scans = [scan(pace) for pace in paces]
+    own = min(own, len(scans) - 1)
+    said = to_decide(scans, own, LINE, kinds)
+    assert said.startswith(f"needs {first}")
+    assert said.endswith(" or an accelerometer in the bag")
+    scans[own] = scan(paces[own], felt=object())
+    assert "accelerometer" not in to_decide(scans, own, LINE, kinds)
+
+
+def test_frequencies_that_fold_are_named_from_the_lowest():
+    """680 Hz sampled at 1 kHz is seen at 320 Hz, and so is 1320 Hz."""
+    assert images(320.0, 1000.0) == "680.000 Hz, 1.32000 kHz, …"

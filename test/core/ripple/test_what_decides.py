@@ -1,0 +1,50 @@
+"""What a line is said to need, and the figures it is told with, each worked out by hand."""
+
+import pytest
+from even_scans import NM, line, scan, seen_by
+
+from omsm_ros.core.ripple.ripple_guard import along, hertz, images, name_lines
+from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TURN
+from omsm_ros.core.ripple.source_hypotheses import PART, SYNCHRONOUS, UNDECIDED, VIBRATION
+
+
+def test_what_is_sharp_in_one_coordinate_alone_is_told_in_its_unit():
+    one = scan(path_like=PATH)
+    one.lines = (line(2500.0, coordinate=PATH), line(123.4), line(7.0, coordinate=TURN))
+    ((mark, shake, order),) = name_lines([one])
+    assert (mark.kind, mark.wavelength) == (PART, pytest.approx(400e-6))
+    assert (order.kind, order.order) == (SYNCHRONOUS, 7)
+    assert (shake.kind, shake.frequency) == (VIBRATION, None)
+    assert "7 waves a turn" in order.evidence[0]
+    assert "itself or the image of 876.600 Hz, 1.12340 kHz" in shake.evidence[1]
+
+
+def test_rings_and_spindle_at_one_feed_a_turn_need_another_feed():
+    """31 waves a turn are rings of 2.42 µm in both: 75 µm a turn."""
+    scans = [
+        scan(name="A", turning=0.5, feed=0.75e-4),
+        scan(name="B", turning=0.83, pace=0.067, feed=0.75e-4),
+    ]
+    for one in scans:
+        one.lines = (seen_by(one, "c", 31, 4 * NM),)
+    for (row,) in name_lines(scans):
+        assert (row.kind, row.needs) == (UNDECIDED, "needs a scan with another feed per turn")
+
+
+def test_with_another_feed_the_spindle_is_known():
+    scans = [
+        scan(name="A", turning=0.5, feed=0.75e-4),
+        scan(name="B", turning=0.83, pace=0.067, feed=0.9e-4),
+    ]
+    for one in scans:
+        one.lines = (seen_by(one, "c", 31, 4 * NM),)
+    for (row,) in name_lines(scans):
+        assert (row.kind, row.order, row.needs) == (SYNCHRONOUS, 31, "")
+
+
+def test_words_of_places_and_frequencies():
+    assert along(PATH) == "along the path"
+    assert along(RADIUS) == "from ring to ring"
+    assert along(TURN) == "over turn"
+    assert hertz(123.456789) == "123.457 Hz"
+    assert images(10.0, 100.0).startswith("90.0000 Hz, 110.000 Hz")

@@ -1,0 +1,122 @@
+"""What the trigger count and the stamp tell about a stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.streams.blocks import Block
+from omsm_ros.core.streams.continuity import Arrival, TriggerCount
+
+
+def block(first: int, stamp_s: float) -> Block:
+    return Block(stamp_ns=round(stamp_s * 1e9), first_sample=first, sample_period=1e-3)
+
+
+@dataclass
+class Stream:
+    """A sequence fed with blocks of 100 samples."""
+
+    sequence: TriggerCount
+
+    def __call__(self, first: int, stamp_s: float, length: int = 100) -> Arrival:
+        return self.sequence.place(block(first, stamp_s), length)
+
+
+@pytest.fixture
+def stream() -> Stream:
+    return Stream(TriggerCount())
+
+
+def test_blocks_in_order_are_one_session(stream: Stream) -> None:
+    places = [stream(100 * k, 0.1 * k) for k in range(5)]
+    assert places == [Arrival(0, 100 * k, 0, 0) for k in range(5)]
+
+
+def test_a_gap_is_no_new_session(stream: Stream) -> None:
+    stream(0, 0.0)
+    assert stream(700, 0.7) == Arrival(0, 700, 0, 0)
+
+
+def test_a_repeated_block_is_left_out_whole(stream: Stream) -> None:
+    stream(0, 0.0)
+    stream(100, 0.1)
+    assert stream(100, 0.1) == Arrival(0, 100, 100, 0)
+    assert stream(0, 0.0) == Arrival(0, 0, 100, 0)
+    assert stream(200, 0.2) == Arrival(0, 200, 0, 0)
+
+
+def test_an_overlap_loses_what_was_seen(stream: Stream) -> None:
+    stream(0, 0.0)
+    assert stream(60, 0.06) == Arrival(0, 60, 40, 0)
+    assert stream(160, 0.16) == Arrival(0, 160, 0, 0)
+
+
+def test_a_late_block_falls_into_its_gap(stream: Stream) -> None:
+    stream(0, 0.0)
+    stream(200, 0.2)
+    assert stream(100, 0.1) == Arrival(0, 100, 100, 100)
+
+
+def test_a_late_block_may_be_partly_known(stream: Stream) -> None:
+    stream(0, 0.0)
+    stream(150, 0.15)
+    assert stream(100, 0.1) == Arrival(0, 100, 100, 50)
+
+
+def test_a_count_that_falls_back_in_later_time_is_a_restart(stream: Stream) -> None:
+    stream(5000, 5.0)
+    assert stream(0, 5.2) == Arrival(1, 0, 0, 0)
+    assert stream(100, 5.3) == Arrival(1, 100, 0, 0)
+
+
+def test_a_restart_into_the_middle_of_the_newest_block_shows_by_its_time(stream: Stream) -> None:
+    stream(0, 0.0)
+    assert stream(50, 30.0) == Arrival(1, 50, 0, 0)
+
+
+def test_time_lapse_is_no_restart(stream: Stream) -> None:
+    # Ten times faster than real: the stamps advance by a tenth of the count.
+    places = [stream(100 * k, 0.01 * k) for k in range(50)]
+    assert {place.session for place in places} == {0}
+    assert all(place.skip == 0 for place in places)
+
+
+@pytest.mark.parametrize("first", [0, 700], ids=["falls back", "goes on"])
+def test_time_set_back_far_is_a_new_session(stream: Stream, first: int) -> None:
+    stream(500, 60.0)
+    assert stream(first, 1.0).session == 1
+
+
+def test_counts_beyond_32_bits_go_on(stream: Stream) -> None:
+    stream(2**32 - 50, 0.0)
+    assert stream(2**32 + 50, 0.1) == Arrival(0, 2**32 + 50, 0, 0)
+
+
+@pytest.mark.parametrize("before", [2**32 - 100, 2**32 - 5_000_000])
+def test_a_count_that_falls_to_zero_is_a_restart_wherever_it_was(
+    stream: Stream, before: int
+) -> None:
+    stream(before, 0.0)
+    assert stream(0, 0.5) == Arrival(1, 0, 0, 0)
+
+
+def test_after_an_end_everything_is_new(stream: Stream) -> None:
+    stream(0, 0.0)
+    stream.sequence.end()
+    assert stream(100, 0.1) == Arrival(1, 100, 0, 0)
+
+
+def test_a_clock_set_back_is_seen_after_messages_that_a_bag_joined() -> None:
+    """Of a block of a minute the last message counts, as where each comes by itself."""
+    parts = np.array([(100 * k, 100_000_000 * k) for k in range(600)])
+    for joined in (False, True):
+        sequence = TriggerCount()
+        if joined:
+            sequence.place(replace(block(0, 0.0), parts=parts), 60_000)
+        else:
+            for first, stamp_ns in parts.tolist():
+                sequence.place(block(first, stamp_ns * 1e-9), 100)
+        assert sequence.place(block(60_000, 55.0), 100) == Arrival(1, 60_000, 0, 0)

@@ -1,0 +1,152 @@
+"""Stamps that a bag brings by thousands are judged as those that come one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.streams import trigger_slips
+from omsm_ros.core.streams.blocks import AxisBlock, joined, uninterrupted
+from omsm_ros.core.streams.continuity import StampHistory, StampLine, stamps_ahead
+from omsm_ros.core.streams.trigger_slips import CommonTrigger
+
+from .test_slips import Device, join, without
+
+MINUTE = np.arange(60_000)
+Blocks = Sequence[tuple[AxisBlock, np.ndarray]]
+
+
+def as_a_bag_gives_them(blocks: Blocks) -> list[tuple[AxisBlock, np.ndarray]]:
+    """Blocks that follow on as one, which keeps the stamps of all."""
+    made: list[tuple[AxisBlock, np.ndarray]] = []
+    place = 0
+    for run in uninterrupted([block for block, _ in blocks]):
+        parts = np.array([(block.first_sample, block.stamp_ns) for block in run])
+        numbers = np.concatenate([n for _, n in blocks[place : place + len(run)]])
+        made.append((replace(joined(run), parts=parts), numbers))
+        place += len(run)
+    return made
+
+
+def lossy(blocks: Blocks, seed: int) -> list[tuple[AxisBlock, np.ndarray]]:
+    """Every hundredth block or so was lost."""
+    kept = np.random.default_rng(seed).random(len(blocks)) > 0.01
+    return [block for block, keep in zip(blocks, kept, strict=True) if keep]
+
+
+def moved(blocks: Blocks, since: int, by_ns: int) -> list[tuple[AxisBlock, np.ndarray]]:
+    """Stamps from a sample on, moved."""
+    return [
+        (replace(b, stamp_ns=b.stamp_ns + by_ns) if b.first_sample >= since else b, n)
+        for b, n in blocks
+    ]
+
+
+def two(jitter: float | None = 2e-5, lengths: tuple[int, int] = (100, 64)) -> tuple[Blocks, Blocks]:
+    axes = Device(MINUTE, lengths[0], jitter=jitter, seed=1, regressed=False).blocks()
+    return axes, Device(MINUTE, lengths[1], jitter=jitter, seed=2, regressed=False).blocks()
+
+
+def slipped() -> tuple[Blocks, Blocks]:
+    probe = Device(without(MINUTE, 31_111, 3), 64, jitter=2e-5, seed=2, regressed=False)
+    return two()[0], probe.blocks()
+
+
+def lost() -> tuple[Blocks, Blocks]:
+    axes, probe = two()
+    return lossy(axes, 3), lossy(probe, 4)
+
+
+def paused() -> tuple[Blocks, Blocks]:
+    axes, probe = two()
+    return moved(axes, 24_000, 3 * 10**9), moved(probe, 24_000, 3 * 10**9)
+
+
+def parted() -> tuple[Blocks, Blocks]:
+    """One driver's, until the clock of one stream steps by less than what is a slip."""
+    axes, probe = two(None, (100, 100))
+    return axes, moved(probe, 30_000, 100_000)
+
+
+RECORDINGS: dict[str, Callable[[], tuple[Blocks, Blocks]]] = {
+    "one driver": lambda: two(None, (100, 100)),
+    "one clock": lambda: two(None),
+    "two drivers": two,
+    "uneven": lambda: two(2e-4),
+    "often off": lambda: two(8e-4),
+    "single samples": lambda: two(2e-5, (100, 3)),
+    "slip": slipped,
+    "lost": lost,
+    "pause": paused,
+    "part company": parted,
+}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_pairs_and_accounts_are_those_of_blocks_one_by_one(name: str) -> None:
+    axes, probe = RECORDINGS[name]()
+    each = join(axes, probe)
+    together = join(as_a_bag_gives_them(axes), as_a_bag_gives_them(probe))
+    assert (together.axes, together.distance) == (each.axes, each.distance)
+    assert together.accounts == each.accounts
+    assert together.seen_from == each.seen_from
+    assert together.watch is not None
+    assert each.watch is not None
+    assert together.watch.found == each.watch.found
+    assert (
+        together.watch.one_driver is each.watch.one_driver is (name in ("one driver", "one clock"))
+    )
+    assert (each.slipped > 10_000) is (name == "slip")
+
+
+@pytest.mark.parametrize("name", ["one driver", "two drivers", "lost", "pause"])
+def test_few_stamps_are_looked_at_by_themselves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    observe = trigger_slips.SlipWatch._observe
+
+    def counted(watch: trigger_slips.SlipWatch, count: int, period_ns: float) -> None:
+        seen.append(count)
+        observe(watch, count, period_ns)
+
+    monkeypatch.setattr(trigger_slips.SlipWatch, "_observe", counted)
+    axes, probe = RECORDINGS[name]()
+    join(as_a_bag_gives_them(axes), as_a_bag_gives_them(probe), CommonTrigger())
+    # Of 1537: those of the first two seconds, and a few where streams are cut.
+    assert len(seen) < 400
+
+
+def test_stamps_ahead_are_those_that_the_lines_tell_one_by_one() -> None:
+    random = np.random.default_rng(5)
+    lines, single = (StampLine(), StampLine()), (StampLine(), StampLine())
+    for line, other in zip(lines, single, strict=True):
+        counts = np.cumsum(random.integers(1, 120, 300))
+        stamps = 1_700_000_000 * 10**9 + counts * 1_000_000 + random.integers(-(10**5), 10**5, 300)
+        stamps[150:] += 10**9
+        line.extend(0, counts, stamps)
+        for count, stamp in zip(counts.tolist(), stamps.tolist(), strict=True):
+            other.add(0, count, stamp)
+        for each in (line, other):
+            each.advance(0, 200)
+    ahead = stamps_ahead(lines, (0, 0), 9000, 1e6)
+    assert ahead is not None
+    rows, leaps = ahead
+    assert np.sum(leaps) == 2
+    axes, distance = single
+    for (count, skew, *begun, time), leap in zip(rows.tolist(), leaps.tolist(), strict=True):
+        assert min(line.next_in(0, 9000) for line in single) == count
+        assert any(line.leaps(0, int(count), 1e6) for line in single) == leap
+        assert [line.advance(0, int(count)) for line in single] == begun
+        assert axes.later_than(distance, (0, 0), 1e6) == skew
+        assert axes.stamp_of(0, int(count), 1e6) == time
+    assert min(line.next_in(0, 9000) for line in single) == 9000
+
+
+def test_a_history_holds_the_last_rows_in_their_order() -> None:
+    history, rows = StampHistory(10), np.arange(500.0).reshape(100, 5)
+    for start, stop in ((0, 3), (3, 4), (4, 18), (18, 60), (60, 61), (61, 75), (75, 99), (99, 100)):
+        history.add(rows[start:stop])
+        assert np.array_equal(history.rows, rows[max(stop - 10, 0) : stop])
+    assert np.array_equal(history.after(rows[95, 0]), rows[96:])

@@ -1,0 +1,89 @@
+"""CHRocodiles that differ within what is published: averaging, sync bytes, answers to VER."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from omsm_ros.instruments.chrocodile.device import ChrocodileDevice, ChrocodileSettings
+from omsm_ros.instruments.chrocodile.emulator import (
+    AXIS_SCALING,
+    ChrocodileEmulator,
+    ChrocodilePacketEmulator,
+)
+from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
+
+SIX = ChrocodileSettings(axes=AXIS_SCALING)
+BOTH = [
+    (ChrocodileEmulator, ChrocodileDevice),
+    (ChrocodilePacketEmulator, ChrocodilePacketDevice),
+]
+
+
+@pytest.mark.parametrize(("emulator", "device"), BOTH)
+def test_a_device_that_averages_still_sends_at_the_rate_that_is_set(
+    emulator: Any, device: Any, bench: Any
+) -> None:
+    run = bench(emulator, device, replace(SIX, averaging=4))
+    run.run(1.5)
+    run.end()
+    run.check()
+    assert run.instrument.rate() == 1000
+    assert run.delivered > 1300
+    assert run.troubles == []
+
+
+def test_averaging_that_the_device_had_before_is_known(bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, SIX)
+    run.instrument._values["AVD"] = "10"
+    run.run(1.0)
+    run.end()
+    assert run.instrument.rate() == 1000
+    assert run.delivered > 800
+
+
+def test_a_device_that_averages_without_slowing_down_is_set_anew(bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, replace(SIX, averaging=4))
+    run.instrument.rate = lambda: float(run.instrument._values["SHZ"])
+    run.run(3.0)
+    assert run.instrument.rate() == 1000
+    assert len(run.troubles) == 1
+    assert "averages 4 exposures" in run.troubles[0]
+    before = run.delivered
+    run.run(1.0)
+    assert run.delivered - before > 900
+
+
+def test_a_trigger_is_below_the_rate_of_what_is_averaged(bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, replace(SIX, trigger="each", averaging=4))
+    run.run(0.2)
+    assert float(run.instrument._values["SHZ"]) == pytest.approx(4200, rel=1e-4)
+
+
+def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, SIX, sync=b"xy")
+    run.run(4.0)
+    run.end()
+    assert len(run.troubles) == 1
+    assert "no telegram that could be read" in run.troubles[0]
+    assert run.delivered > 800
+
+
+@pytest.mark.parametrize("form", ["binary", "ascii"])
+def test_a_telegram_that_waits_for_the_next_one_is_not_stamped_late(form: str, bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, replace(SIX, format=form), interval=1e-3)
+    run.run(2.0)
+    block = run.blocks[-1].distance
+    # Sample k is due k + 1 periods after the start, and read in the next millisecond.
+    due = run.instrument._started + (block.first_sample + 2) * 1e-3
+    assert abs(block.stamp_ns * 1e-9 - due) < 1e-4
+
+
+def test_a_refusal_is_no_version(bench: Any) -> None:
+    run = bench(ChrocodileEmulator, ChrocodileDevice, SIX)
+    usual = run.instrument._answer
+    run.instrument._answer = lambda r: "not valid" if r.name == "VER" else usual(r)
+    run.run(0.3)
+    assert run.device.identity["model"] == "CHRocodile"

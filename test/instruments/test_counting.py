@@ -1,0 +1,127 @@
+"""Which sample it is: wraps, gaps, restarts, copies and spoilt counters, against plain cases."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omsm_ros.instruments.counting import SAMPLE, Counting, Samples, SequenceTracker
+
+FREE = Counting(2**16, timed=False, checked=False, period=1e-3)
+TRIGGERED = Counting(2**16, timed=False, checked=False)
+
+
+def samples(counters: list[int], content: int = 0) -> Samples:
+    made = np.zeros(len(counters), SAMPLE)
+    made["counter"] = np.array(counters) % 2**16
+    made["distance"] = np.array(counters) + content
+    return made
+
+
+def numbers(tracker: SequenceTracker, *portions: Samples, **options: object) -> list[int]:
+    found = []
+    for portion in portions:
+        for run in tracker.split(portion, **options):  # type: ignore[arg-type]
+            found += list(range(run.first_sample, run.first_sample + len(run.samples)))
+    for run in tracker.settle():
+        found.append(run.first_sample)
+    return found
+
+
+def test_a_counter_of_16_bits_goes_on() -> None:
+    tracker = SequenceTracker(FREE)
+    count = list(range(65_000, 200_000))
+    assert numbers(tracker, samples(count)) == count
+    assert (tracker.lost, tracker.restarts) == (0, 0)
+
+
+def test_a_packet_sent_twice_is_counted_and_left_out() -> None:
+    tracker = SequenceTracker(FREE)
+    packet = samples(list(range(100, 130)))
+    assert numbers(tracker, packet, packet, samples([130, 131])) == list(range(100, 132))
+    assert (tracker.duplicates, tracker.restarts, tracker.lost) == (30, 0, 0)
+
+
+def test_a_counter_that_falls_back_with_other_samples_is_a_restart() -> None:
+    tracker = SequenceTracker(FREE)
+    found = numbers(tracker, samples(list(range(500, 520))), samples(list(range(30)), content=9))
+    assert found == [*range(500, 520), *range(30)]
+    assert (tracker.restarts, tracker.duplicates) == (1, 0)
+
+
+@given(st.integers(1, 8), st.integers(0, 2**16 - 1))
+def test_a_counter_that_leaps_and_comes_back_is_spoilt(place: int, wrong: int) -> None:
+    count = list(range(100, 110))
+    spoilt = samples(count)
+    spoilt["counter"][place] = wrong
+    tracker = SequenceTracker(FREE)
+    found = numbers(tracker, spoilt)
+    expected = [c for i, c in enumerate(count) if i != place]
+    if wrong in count[place - 1 : place + 2]:  # another sample's number, or its own
+        assert set(expected) <= {*found, count[place - 1], count[place + 1]}
+    else:
+        assert found == expected
+        assert (tracker.spoilt, tracker.lost, tracker.restarts) == (1, 1, 0)
+
+
+def test_a_leap_is_held_until_the_next_sample_tells() -> None:
+    tracker = SequenceTracker(FREE)
+    assert numbers(tracker, samples([1, 2])) == [1, 2]
+    assert list(tracker.split(samples([9]))) == []
+    assert tracker.held == 1
+    assert numbers(tracker, samples([10])) == [9, 10]
+    assert tracker.lost == 6
+
+
+@pytest.mark.parametrize(("silence", "lost"), [(0.1, 100), (65.7, 100 + 65_536), (131.2, 131_172)])
+def test_whole_turns_in_a_silence_are_found_from_its_length(silence: float, lost: int) -> None:
+    tracker = SequenceTracker(FREE)
+    numbers(tracker, samples([7]))
+    numbers(tracker, samples([108, 109]), elapsed=silence, broken=True)
+    assert (tracker.lost, tracker.restarts) == (lost, 0)
+
+
+def test_more_samples_than_time_passed_for_are_a_restart() -> None:
+    tracker = SequenceTracker(FREE)
+    numbers(tracker, samples([100]))
+    assert numbers(tracker, samples([5000, 5001]), elapsed=1.0, broken=True) == [5000, 5001]
+    assert (tracker.restarts, tracker.lost) == (1, 0)
+
+
+def test_fewer_samples_than_time_passed_for_are_a_restart() -> None:
+    """The counter began again at zero, and has come as far as if it had only lost some."""
+    tracker = SequenceTracker(FREE)
+    numbers(tracker, samples([1000]))
+    assert numbers(tracker, samples([2300, 2301]), elapsed=2.3, broken=True) == [2300, 2301]
+    assert (tracker.restarts, tracker.lost) == (1, 0)
+
+
+def test_a_triggered_counter_at_zero_after_a_silence_is_a_restart() -> None:
+    tracker = SequenceTracker(TRIGGERED)
+    numbers(tracker, samples([57_391, 57_392]))
+    assert numbers(tracker, samples([0, 1]), elapsed=3.0, broken=True) == [0, 1]
+    assert (tracker.restarts, tracker.lost) == (1, 0)
+
+
+def test_a_device_known_to_have_been_restarted_counts_from_its_number() -> None:
+    tracker = SequenceTracker(FREE)
+    numbers(tracker, samples([100, 101]))
+    tracker.begin_anew()
+    assert numbers(tracker, samples([102, 103])) == [102, 103]
+    assert (tracker.restarts, tracker.lost) == (1, 0)
+
+
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=40), st.integers(0, 2**16 - 1), st.data())
+def test_any_portions_give_the_same_numbers(
+    steps: list[int], start: int, data: st.DataObject
+) -> None:
+    count = np.cumsum([start, *steps]).tolist()
+    cuts = sorted({0, len(count), *data.draw(st.lists(st.integers(0, len(count))))})
+    tracker = SequenceTracker(TRIGGERED)
+    portions = [samples(count[a:b]) for a, b in itertools.pairwise(cuts)]
+    assert numbers(tracker, *portions) == count
+    assert tracker.lost == count[-1] - count[0] + 1 - len(count)

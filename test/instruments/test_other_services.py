@@ -1,0 +1,66 @@
+"""What else may be on the port, or wrong in the settings: one line that says so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.errors import DeviceError, NoSamplesError
+from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileDevice, ChrocodileSettings
+from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
+from omsm_ros.instruments.chrocodile.packet_protocol import Command, encode_command
+from omsm_ros.instruments.micro_epsilon.device import ConfocalDtDevice, ConfocalDtSettings
+from omsm_ros.instruments.micro_epsilon.protocol import encode_frames
+
+from .scripted_stream import Script
+
+
+class Service(Script):
+    """Plays its portions, and then hangs up; an echo says what it hears."""
+
+    def __init__(self, *portions: bytes | Exception, echo: bool = False) -> None:
+        super().__init__(*portions)
+        self._echo = echo
+
+    def write(self, data: bytes) -> None:
+        if self._echo:
+            self.portions.append(data)
+
+
+CLOSED = DeviceError("connection was lost: closed by the device")
+
+
+@pytest.mark.parametrize("kind", [ChrocodileDevice, ChrocodilePacketDevice])
+def test_a_web_server_that_hangs_up_is_told(kind: type[Chrocodile]) -> None:
+    device = kind(Service(b"HTTP/1.1 400 Bad Request\r\n", CLOSED), ChrocodileSettings())
+    with pytest.raises(DeviceError, match=r"HTTP/1\.1 400.*no CHRocodile is there"):
+        device.open()
+
+
+def test_a_service_that_repeats_what_it_hears_is_no_device() -> None:
+    service = Service(encode_command(Command("CONF")), echo=True)
+    device = ChrocodilePacketDevice(service, ChrocodileSettings())
+    with pytest.raises(DeviceError, match="no CHRocodile is there"):
+        device.open()
+
+
+def test_a_counter_that_stands_still_is_told() -> None:
+    """The frame has intensity and counter the other way round than the settings say."""
+    now = [0.0]
+    frames = [np.array([[98_232, 512, 100 * k + i] for i in range(100)]) for k in range(40)]
+    device = ConfocalDtDevice(
+        Script(*map(encode_frames, frames)),
+        ConfocalDtSettings(values=("distance", "counter", "intensity")),
+        lambda: round(now[0] * 1e9),
+        lambda: now[0],
+    )
+    device.open()
+
+    def read() -> None:
+        for _ in frames:
+            now[0] += 0.1
+            device.poll(0.0)
+
+    with pytest.raises(NoSamplesError, match="repeats its sample counter, 512 last"):
+        read()
+    assert now[0] < 2.5

@@ -1,0 +1,127 @@
+"""Stamps, values that need memory, and connection of the generic stream."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.streams.blocks import Status
+from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
+from omsm_ros.instruments.six_channel.protocol import AxisScaling, StreamScaling, encode_frames
+
+from .scripted_stream import MS, NEVER, Script, assert_consistent, frames_of, run, spans
+
+# Values that need memory.
+
+
+def test_a_wrapping_encoder_is_unwrapped_across_blocks_and_gaps() -> None:
+    turns = AxisScaling(3600 / (2 * np.pi), wrap=3600)
+    angle = np.linspace(0.3, 40.0, 300)
+    frames = frames_of(np.arange(300))
+    frames["counts"][:, 4] = turns.counts(angle)
+    kept = np.delete(frames, np.arange(120, 125))
+    settings = StreamSettings(block_size=50, pause=NEVER, scaling=StreamScaling(c=turns))
+    blocks, _ = run(encode_frames(kept), settings=settings)
+    found = np.concatenate([axes.c for axes, _ in blocks])
+    expected = np.delete(angle, np.arange(120, 125))
+    assert abs(found - expected).max() <= np.pi / 3600 * 1.001
+
+
+def test_unknown_verdicts_are_counted_and_lost() -> None:
+    frames = frames_of(np.arange(4))
+    frames["status"] = [0, 9, 1, 200]
+    ((_, distance),), device = run(encode_frames(frames))
+    assert distance.status.tolist() == [
+        Status.OK,
+        Status.LOST,
+        Status.NO_TARGET,
+        Status.LOST,
+    ]
+    assert device.unknown_status == 2
+
+
+# Time.
+
+
+def test_stamps_are_of_the_first_sample_on_the_host_clock() -> None:
+    """Frames that arrive at the instant they are taken: host = device + a known offset."""
+    offset = 1_700_000_000_000_000_000
+    wire = [encode_frames(frames_of([i])) for i in range(40)]
+    arrivals = iter(i * MS + offset for i in range(40))
+    device = GenericStreamDevice(
+        Script(*wire), StreamSettings(block_size=10, pause=NEVER), lambda: next(arrivals)
+    )
+    device.open()
+    blocks = [pair for _ in wire for pair in device.poll(0.0)]
+    assert [axes.stamp_ns - offset for axes, _ in blocks] == [0, 10 * MS, 20 * MS, 30 * MS]
+
+
+def test_stamps_of_a_restarted_device_are_of_its_new_clock() -> None:
+    """Up for a day, then again from zero: host time goes on as if nothing had been."""
+    day = 86_400 * 1000 * MS
+    before = frames_of(np.arange(10), start_ns=day)
+    after = frames_of(np.arange(10), start_ns=0)
+    arrivals = iter([9 * MS, 2009 * MS])
+    device = GenericStreamDevice(
+        Script(encode_frames(before), encode_frames(after)),
+        StreamSettings(block_size=10, pause=NEVER),
+        lambda: day + next(arrivals),
+    )
+    device.open()
+    blocks = device.poll(0.0) + device.poll(0.0)
+    assert [axes.stamp_ns - day for axes, _ in blocks] == [0, 2000 * MS]
+
+
+@pytest.mark.parametrize(
+    ("deviation", "warnings"), [(0.0, 0), (90e-6, 0), (-90e-6, 0), (110e-6, 3), (-0.01, 3)]
+)
+def test_a_wrong_nominal_period_is_noticed(deviation: float, warnings: int) -> None:
+    frames = frames_of(np.arange(330))
+    frames["device_time"] = np.rint(np.arange(330) * MS * (1 + deviation))
+    _, device = run(encode_frames(frames))
+    assert device.statistics.period_warnings == warnings
+    assert device.statistics.period_deviation == pytest.approx(deviation, abs=1e-8)
+
+
+# Connection.
+
+
+def test_the_constructor_touches_nothing() -> None:
+    script = Script()
+    GenericStreamDevice(script)
+    assert script.opened == 0
+
+
+def test_a_lost_connection_costs_nothing_that_had_arrived() -> None:
+    wire = encode_frames(frames_of(np.arange(12)))
+    device = GenericStreamDevice(
+        Script(wire[: 5 * 63 + 30], DeviceError("gone"), wire[7 * 63 :]),
+        StreamSettings(pause=NEVER),
+    )
+    device.open()
+    assert device.poll(0.0) == []
+    with pytest.raises(DeviceError, match="gone"):
+        device.poll(0.0)
+    blocks = device.close()
+    device.open()
+    device.poll(0.0)
+    blocks += device.close()
+    assert spans(blocks) == [(0, 5), (7, 5)]
+    assert_consistent(blocks, device)
+    found = device.statistics
+    assert (found.lost, found.gaps, device.wire.bad_length) == (2, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"sample_period": 0.0}, r"sample_period 0\.0"),
+        ({"pause": -1.0}, r"pause -1\.0"),
+        ({"block_size": 0}, "block_size 0"),
+        ({"block_size": 10**7}, "block_size 10000000"),
+    ],
+)
+def test_senseless_settings_are_refused(arguments: dict[str, float], named: str) -> None:
+    with pytest.raises(ConfigurationError, match=named):
+        StreamSettings(**arguments)

@@ -1,0 +1,62 @@
+"""What the library SurfaceTopography reads, with the library written down here."""
+
+import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from omsm_ros.errors import FileError
+from omsm_ros.io.maps.read_map import read_points
+from omsm_ros.units import LengthUnits
+
+# Of a plane, in both directions, and the sizes of its map and of one of its places [µm].
+SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
+
+
+@pytest.fixture
+def map_of(tmp_path, monkeypatch):
+    """A file that the library takes for a map, whose heights begin with the direction x."""
+
+    def made(unit="µm", sizes=SIZES, heights=None):
+        x, y = (size / n * np.arange(n) for size, n in zip(SIZES, PLACES, strict=True))
+        plane = SLOPES[0] * x[:, np.newaxis] + SLOPES[1] * y if heights is None else heights
+        found = SimpleNamespace(heights=lambda: plane, physical_sizes=sizes, unit=unit)
+        reader = SimpleNamespace(topography=lambda: found)
+        library = SimpleNamespace(open_topography=lambda path: nullcontext(reader))
+        monkeypatch.setitem(sys.modules, "SurfaceTopography", library)
+        path = tmp_path / "map.other"
+        path.write_bytes(b"\0" * 100)
+        return path
+
+    return made
+
+
+def test_a_plane_keeps_its_slopes_and_its_size(map_of):
+    points = read_points(map_of())
+    design = np.stack([points.x, points.y, np.ones(len(points.x))], axis=1)
+    found = np.linalg.lstsq(design, points.height, rcond=None)[0]
+    np.testing.assert_allclose(found[:2], SLOPES, rtol=1e-9)
+    # From the first place to the last: one less than the map has.
+    assert np.ptp(points.x) == pytest.approx(38e-6)
+    assert np.ptp(points.y) == pytest.approx(12e-6)
+
+
+def test_lost_places_are_no_points(map_of):
+    heights = np.ma.masked_less(np.arange(100.0).reshape(PLACES), 10.0)
+    points = read_points(map_of(heights=heights))
+    assert np.sum(np.isfinite(points.height)) == 90
+
+
+def test_a_unit_that_the_file_lacks_is_asked_for(map_of):
+    with pytest.raises(FileError, match="--unit"):
+        read_points(map_of(unit=None))
+    stated = read_points(map_of(unit=None), LengthUnits(1e-3, 1e-6))
+    assert np.ptp(stated.x) == pytest.approx(38e-3)
+
+
+@pytest.mark.parametrize("wrong", [{"sizes": None}, {"heights": np.arange(5.0)}])
+def test_what_is_no_map_of_two_directions_is_refused(map_of, wrong):
+    with pytest.raises(FileError, match="no map with its size"):
+        read_points(map_of(**wrong))

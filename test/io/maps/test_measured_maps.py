@@ -1,0 +1,121 @@
+"""Maps that others measured, with the figures that were published with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.form.analyse import analyse_form
+from omsm_ros.core.registration.placement import Portion
+from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.nominal import Flat
+from omsm_ros.errors import FileError
+from omsm_ros.io.maps.columns_file import load_dabam
+from omsm_ros.io.maps.read_map import read_points
+
+DATA = Path(__file__).parents[4] / "shared" / "data" / "surfaces"
+pytestmark_data = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the measured maps are not on this machine"
+)
+
+
+@pytestmark_data
+def test_the_zeiss_map():
+    points = read_points(DATA / "zeiss_19-0057_vfm.asc")
+    assert np.ptp(points.height) == pytest.approx(19.2e-9, abs=0.05e-9)
+    grid = as_grid(points)
+    assert grid.height.shape == (81, 681)
+    u, v = points.x / 0.25, points.y / 0.015
+    design = np.stack([u**i * v**j for i in range(3) for j in range(3 - i)], axis=1)
+    rest = points.height - design @ np.linalg.lstsq(design, points.height, rcond=None)[0]
+    assert np.ptp(rest) == pytest.approx(8.95e-9, abs=0.005e-9)
+    assert np.std(rest) == pytest.approx(1.52e-9, abs=0.005e-9)
+
+
+@pytestmark_data
+def test_a_dabam_profile_of_heights():
+    profile = load_dabam(DATA / "dabam" / "dabam-012.dat")
+    points = read_points(DATA / "dabam" / "dabam-012.dat")
+    assert not profile.slopes
+    assert np.ptp(points.x) == pytest.approx(profile.header["LENGTH_OPTICAL"], abs=1e-3)
+    # The header's figures are of the residual, whose columns the file repeats beside.
+    raw = np.loadtxt(DATA / "dabam" / "dabam-012.dat", skiprows=1)
+    slope = np.std(raw[:, 4])
+    assert slope == pytest.approx(profile.header["CALC_SLOPE_RMS"], rel=2e-3)
+    best = points.height - np.polyval(np.polyfit(points.x, points.height, 2), points.x)
+    assert np.std(best) == pytest.approx(profile.header["CALC_HEIGHT_RMS"] * 1e-9, rel=0.1)
+
+
+@pytestmark_data
+def test_a_dabam_profile_of_slopes():
+    profile = load_dabam(DATA / "dabam" / "dabam-018.dat")
+    points = read_points(DATA / "dabam" / "dabam-018.dat")
+    assert profile.slopes
+    assert np.ptp(points.x) == pytest.approx(profile.header["LENGTH_OPTICAL"], abs=1e-3)
+    # Its own text says 24.4 km and, less that circle, 0.12 µrad of residual slope.
+    line = np.polyfit(profile.position, profile.value, 1)
+    assert 1 / line[0] == pytest.approx(24.4e3, rel=0.02)
+    rest = profile.value - np.polyval(line, profile.position)
+    stated = profile.header["CALC_SLOPE_RMS"] * profile.header["CALC_SLOPE_RMS_FACTOR"]
+    assert np.std(rest) == pytest.approx(stated, rel=0.05)
+    back = np.gradient(points.height, points.x)[1:-1]
+    assert back == pytest.approx(profile.value[1:-1], abs=0.1e-6)
+
+
+@pytestmark_data
+@pytest.mark.parametrize(
+    ("name", "rms", "extent", "slope"),
+    [("012", 2.503e-9, 11.535e-9, 0.3188e-6), ("018", 1.7556e-9, 7.087e-9, 0.12e-6)],
+)
+def test_the_form_of_a_profile_is_what_its_file_and_a_parabola_say(name, rms, extent, slope):
+    """Height less a parabola by numpy alone; slope as the header has it, of points 1 mm apart."""
+    points = read_points(DATA / "dabam" / f"dabam-{name}.dat")
+    portion = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
+    found = analyse_form(Flat(), lambda: [portion], ("piston", "tilt")).deviation
+    for figure, truth in (
+        ("rms_without_second_order", rms),
+        ("peak_to_valley_without_second_order", extent),
+        ("slope_rms_without_second_order", slope),
+    ):
+        off = abs(found[figure].value - truth)
+        assert off < 2 * found[figure].uncertainty + 0.02 * truth, figure
+
+
+HEADER = '{"FILE_FORMAT": 2, "FILE_HEADER_LINES": 1, "X1_FACTOR": 0.001, "Y1_FACTOR": 1e-9}'
+
+
+def _dabam(folder, header=HEADER, data="x h r\n0 1 9\n1 2 9\n2 4 9\n"):
+    (folder / "p.txt").write_text(header)
+    (folder / "p.dat").write_text(data)
+    return folder / "p.dat"
+
+
+def test_factors_of_the_header_hold(tmp_path):
+    points = read_points(_dabam(tmp_path))
+    assert points.x == pytest.approx([0, 1e-3, 2e-3])
+    assert points.height == pytest.approx([1e-9, 2e-9, 4e-9])
+
+
+def test_slopes_of_a_circle_integrate_to_it(tmp_path):
+    x = np.linspace(-100, 100, 401)
+    data = "x s\n" + "".join(f"{a} {a * 2.0}\n" for a in x)
+    header = HEADER.replace('FORMAT": 2', 'FORMAT": 1').replace("1e-9", "1e-6")
+    points = read_points(_dabam(tmp_path, header, data))
+    circle = points.x**2 / (2 * 500)  # 2 µrad/mm is a radius of 500 m
+    assert points.height - points.height.min() == pytest.approx(circle, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "data", "told"),
+    [
+        (HEADER.replace('FORMAT": 2', 'FORMAT": 7'), None, "FILE_FORMAT 7"),
+        (HEADER.replace("0.001", "null"), None, "factors"),
+        (HEADER.replace("1e-9", "-1"), None, "factors"),
+        (HEADER, "x h\n1 2\n3 four\n", "line 3: '3 four' is no row"),
+        (HEADER, "x h\n", "no points"),
+    ],
+)
+def test_a_profile_that_does_not_fit_its_header(tmp_path, header, data, told):
+    path = _dabam(tmp_path, header, *([] if data is None else [data]))
+    with pytest.raises(FileError, match=told):
+        read_points(path)

@@ -1,0 +1,30 @@
+"""What tests of jobs share."""
+
+import pytest
+
+from omsm_ros.io import bags
+from omsm_ros.io.tables.table import load_column_map
+from omsm_ros.pipelines.import_recording import import_recording
+from omsm_ros.pipelines.recording import read_blocks
+
+
+class Importer:
+    """Imports files of a folder by a map, and reads what came out."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.out = folder / "out.mcap"
+
+    def __call__(self, mapping, *files):
+        """What the command reports, of files by name."""
+        (self.folder / "map.yaml").write_text(mapping, encoding="utf-8")
+        mapped, form = load_column_map(self.folder / "map.yaml")
+        return import_recording([self.folder / f for f in files], mapped, form, self.out)
+
+    def blocks(self, topic=bags.DISTANCE_TOPIC):
+        return read_blocks(self.out, (topic,))[topic]
+
+
+@pytest.fixture
+def importer(tmp_path):
+    return Importer(tmp_path)

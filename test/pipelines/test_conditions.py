@@ -1,0 +1,74 @@
+"""When a scan was made, how old its calibration was, and how warm it was: in bag, summary, page."""
+
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+
+from omsm_ros.core.calibration.calibration import RECORDED, age_at
+from omsm_ros.io import bags
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.io.message_mapping import typestore
+from omsm_ros.io.topics import TEMPERATURE_TOPIC
+from omsm_ros.pipelines.measure import measure
+
+DAY_NS = 86_400 * 10**9
+NOON_NS = 1_790_000_000 * 10**9
+
+
+def record(path, blocks, temperatures, start_ns=NOON_NS):
+    types = typestore().types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "probe")
+    with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC, TEMPERATURE_TOPIC)) as bag:
+        for axes, distance in islice(iter(blocks), 30):
+            late = start_ns - blocks[0][0].stamp_ns
+            bag.write_axes(replace(axes, stamp_ns=axes.stamp_ns + late))
+            bag.write_distance(replace(distance, stamp_ns=distance.stamp_ns + late))
+        for k, value in enumerate(temperatures):
+            reading = types["sensor_msgs/msg/Temperature"](header, value, 0.0)
+            bag.write(TEMPERATURE_TOPIC, start_ns + k * 10**8, reading)
+    return path
+
+
+def dated(calibration, recorded_ns):
+    certificate = {**calibration.certificate, RECORDED: recorded_ns}
+    return replace(calibration, certificate=certificate)
+
+
+def test_summary_and_page_tell_age_and_temperature(tmp_path, small_scan_blocks, true_calibration):
+    bag = record(tmp_path / "a.mcap", small_scan_blocks, [20.0, 20.3, 20.1])
+    old = dated(true_calibration, NOON_NS - 3 * DAY_NS)
+    summary = measure(bag, old, tmp_path / "out")
+    told = summary["conditions"]
+    assert told["recorded_ns"] == NOON_NS
+    assert told["calibration_age"] == 3 * 86_400
+    assert told["temperature"] == {
+        "mean": pytest.approx(20.1333, abs=1e-3), "lowest": 20.0, "highest": 20.3,
+        "change": pytest.approx(0.1),
+    }  # fmt: skip
+    page = (tmp_path / "out/report.html").read_text()
+    assert "3.0 d" in page
+    assert "20.13 °C, +0.10 K from the beginning to the end" in page
+    assert "2026-09-21" in page
+
+
+def test_what_nobody_recorded_is_not_known(tmp_path, small_scan_blocks, true_calibration):
+    bag = record(tmp_path / "a.mcap", small_scan_blocks, [], start_ns=10**9)
+    summary = measure(bag, dated(true_calibration, NOON_NS), tmp_path / "out", report=False)
+    assert summary["conditions"] == {
+        "recorded_ns": None, "calibration_age": None, "temperature": None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("entry", [None, "yesterday", 1.5, True])
+def test_a_certificate_without_a_date_has_no_age(true_calibration, entry):
+    assert age_at(dated(true_calibration, entry), NOON_NS) is None
+
+
+def test_a_temperature_that_cannot_be_is_told(tmp_path, small_scan_blocks, true_calibration):
+    """In kelvin, one of them; the scan itself is as good as ever."""
+    bag = record(tmp_path / "a.mcap", small_scan_blocks, [293.15, 20.0])
+    summary = measure(bag, true_calibration, tmp_path / "out", report=False)
+    assert summary["conditions"]["temperature"]["mean"] == 20.0
+    (said,) = [w for w in summary["warnings"] if "temperatures" in w]
+    assert said.startswith("1 of 2 temperatures cannot be, expected from -100 to 200 °C")

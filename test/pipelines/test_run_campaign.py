@@ -1,0 +1,193 @@
+"""A campaign corrects every bag, survives what happens to one, and goes on where it was."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import islice
+
+import pytest
+
+from omsm_ros import cli
+from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.io import bags, calibration_file
+from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.pipelines import campaign as campaign
+from omsm_ros.pipelines.campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
+
+OPTIONS = ("--no-report",)
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory, small_scan_blocks, true_calibration):
+    """Three good bags, one of them in a folder, one that is damaged, and a calibration."""
+    folder = tmp_path_factory.mktemp("shop")
+    (folder / "bags" / "monday").mkdir(parents=True)
+    for name in ("a", "b", "monday/c"):
+        with BagWriter(
+            folder / "bags" / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
+        ) as bag:
+            for axes, distance in islice(iter(small_scan_blocks), 30):
+                bag.write_axes(axes)
+                bag.write_distance(distance)
+    (folder / "bags" / "torn.mcap").write_bytes(b"\x89MCAP0\r\n and then nothing")
+    calibration_file.save_calibration(folder / "cal.json", true_calibration)
+    return folder
+
+
+def states(entries):
+    return {entry.bag: entry.state for entry in entries}
+
+
+def test_every_bag_becomes_a_result_or_a_reason(shop, tmp_path):
+    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
+    assert states(entries) == {
+        "a.mcap": DONE, "b.mcap": DONE, "monday/c.mcap": DONE, "torn.mcap": REFUSED,
+    }  # fmt: skip
+    assert "torn.mcap" in entries[-1].said
+    assert load_campaign(tmp_path) == entries
+    alone = tmp_path / "alone"
+    cli.main(
+        ["correct", str(shop / "bags/a.mcap"), "--calibration", str(shop / "cal.json"),
+         "--out", str(alone), *OPTIONS]
+    )  # fmt: skip
+    for name in ("a", "monday/c"):
+        cloud = (tmp_path / name / "cloud.ply").read_bytes()
+        assert cloud == (alone / "cloud.ply").read_bytes()
+
+
+def test_what_is_done_is_not_done_again(shop, tmp_path, monkeypatch):
+    run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
+    started = []
+
+    def note(task):
+        started.append(task.bag)
+        return campaign.Entry(task.bag, task.folder, task.fingerprint, REFUSED, "still torn")
+
+    monkeypatch.setattr(campaign, "correct_one", note)
+    run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
+    assert started == ["torn.mcap"]
+    started.clear()
+    (tmp_path / "b" / "summary.json").unlink()
+    run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
+    assert sorted(started) == ["b.mcap", "torn.mcap"]
+    started.clear()
+    run_campaign(shop / "bags", shop / "cal.json", tmp_path, (*OPTIONS, "--lateral-lag", "1e-4"))
+    assert len(started) == 4
+
+
+def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch):
+    run = subprocess.run
+
+    def sometimes_killed(command, **options):
+        if any("b.mcap" in part for part in command):
+            command = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
+        return run(command, **options)
+
+    monkeypatch.setattr(campaign.subprocess, "run", sometimes_killed)
+    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
+    assert states(entries)["b.mcap"] == CRASHED
+    assert "SIGKILL" in entries[1].said
+    assert states(entries)["a.mcap"] == states(entries)["monday/c.mcap"] == DONE
+
+
+def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monkeypatch):
+    """Dask gives up a task that took four workers along, and raises what it calls it."""
+
+    class KilledWorker(Exception):
+        pass
+
+    def corrected(task):
+        if task.bag == "b.mcap":
+            raise KilledWorker("Attempted to run task 'b' on 4 different workers")
+        return Entry(task.bag, task.folder, task.fingerprint, DONE, "")
+
+    monkeypatch.setattr(campaign, "correct_one", corrected)
+    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)
+    assert [(e.bag, e.said) for e in entries if e.state == CRASHED] == [
+        ("b.mcap", "no worker came to an end with it (KilledWorker)")
+    ]
+    assert len(entries) == 4
+    assert load_campaign(tmp_path) == entries
+
+
+def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
+    command = [
+        sys.executable, "-m", "omsm_ros.cli", "batch", str(shop / "bags"), "--calibration",
+        str(shop / "cal.json"), "--out", str(tmp_path), "--jobs", "1", "--json", "--", *OPTIONS,
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    while not load_campaign(tmp_path):
+        time.sleep(0.02)
+        assert running.poll() is None
+    os.killpg(running.pid, signal.SIGKILL)
+    running.wait()
+    before = load_campaign(tmp_path)
+    assert 1 <= len(before) < 4
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    entries = json.loads(done.stdout)["entries"]
+    assert [e["state"] for e in entries] == [DONE, DONE, DONE, REFUSED]
+    assert done.returncode == 2
+    assert "1 bags gave no result" in done.stderr
+    page = (tmp_path / "index.html").read_text()
+    assert "torn.mcap" in page
+    assert "refused" in page
+
+
+def test_two_campaigns_do_not_share_a_folder(shop, tmp_path):
+    with (
+        campaign._alone(tmp_path),
+        pytest.raises(FileError, match="another campaign writes"),
+    ):
+        run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
+
+
+def test_a_folder_without_bags_is_refused(shop, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileError, match="no bag below"):
+        run_campaign(tmp_path / "empty", shop / "cal.json", tmp_path / "out")
+    with pytest.raises(FileError, match="no folder"):
+        run_campaign(tmp_path / "none", shop / "cal.json", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("[]", "expected a JSON object"), ("{}", "required"), ("{", "is not JSON")]
+)
+def test_a_damaged_state_is_named(tmp_path, text, said):
+    (tmp_path / "campaign.json").write_text(text)
+    with pytest.raises(FileError, match=said):
+        load_campaign(tmp_path)
+
+
+def test_a_scheduler_that_is_no_address_is_refused(shop, tmp_path):
+    with pytest.raises(ConfigurationError, match="no address: Invalid IPv6"):
+        run_campaign(shop / "bags", shop / "cal.json", tmp_path, scheduler="tcp://[31m:5")
+
+
+@pytest.mark.parametrize("address", ["tcp://10.0.0.7:8786", "ws://localhost:1", "localhost"])
+def test_a_scheduler_beyond_this_host_needs_tls(shop, tmp_path, address):
+    with pytest.raises(ConfigurationError, match="tls://"):
+        run_campaign(shop / "bags", shop / "cal.json", tmp_path, scheduler=address)
+
+
+@pytest.mark.soak
+def test_two_dask_workers_give_the_same_though_one_is_killed(shop, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="Dask is an optional package")
+    options = (*OPTIONS, "--lateral-lag", "1e-4")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        killed = []
+
+        def kill_once(done, total):
+            if done == 1 and not killed:
+                killed.append(os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL))
+
+        entries = run_campaign(
+            shop / "bags", shop / "cal.json", tmp_path, options,
+            scheduler=cluster.scheduler_address, progress=kill_once,
+        )  # fmt: skip
+    assert killed
+    assert sorted(states(entries).values()) == [DONE, DONE, DONE, REFUSED]

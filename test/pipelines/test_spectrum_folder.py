@@ -1,0 +1,103 @@
+"""The folder of a spectrum holds what its last run made, and nothing of a run before it."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import plain_readers
+import pytest
+
+from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.pipelines import publish as publish_spectrum
+from omsm_ros.pipelines.publish import publish_spectra
+from omsm_ros.pipelines.spectrum import SpectrumOptions, without_bands
+
+
+def points(count):
+    ramp = np.arange(count, dtype=np.float64)
+    return SurfacePoints(
+        sample=np.arange(count), x=ramp, y=ramp, height=ramp, dynamic_error=ramp,
+        uncertainty=ramp, intensity=ramp.astype(np.float32),
+    )  # fmt: skip
+
+
+def scan(name, count, removed=0.25):
+    stopped = SimpleNamespace(removed=np.full(count, removed))
+    studied = SimpleNamespace(signal=SimpleNamespace(name=name))
+    return SimpleNamespace(studied=studied, points=points(count), stopped=stopped)
+
+
+@pytest.fixture
+def publish(monkeypatch, tmp_path):
+    """What is studied of each scan is not asked here: only what comes of it."""
+    monkeypatch.setattr(publish_spectrum, "summary_of", lambda scans, _: {"scans": len(scans)})
+
+    def made(counts, stop=((1.0, 2.0),)):
+        scans = [scan(f"s{k}", count) for k, count in enumerate(counts)]
+        monkeypatch.setattr(publish_spectrum, "spectra_of", lambda *_: scans)
+        options = SpectrumOptions(stop=stop)
+        return publish_spectra([""] * len(scans), options, tmp_path / "out", report=False)
+
+    return made
+
+
+def held(tmp_path):
+    return sorted(path.name for path in (tmp_path / "out").iterdir())
+
+
+def test_each_scan_has_its_cloud_without_the_band(publish, tmp_path):
+    summary = publish([5, 7])
+    assert held(tmp_path) == ["band_stopped_1.ply", "band_stopped_2.ply", "spectrum.json"]
+    assert json.loads((tmp_path / "out" / "spectrum.json").read_text()) == summary
+    assert summary["files"] == {
+        "spectrum": "spectrum.json", "s0 without the band": "band_stopped_1.ply",
+        "s1 without the band": "band_stopped_2.ply",
+    }  # fmt: skip
+    for name, count in (("band_stopped_1.ply", 5), ("band_stopped_2.ply", 7)):
+        cloud = plain_readers.ply(tmp_path / "out" / name)
+        assert cloud["height"] == [k - 0.25 for k in range(count)]
+        assert cloud["x"] == list(range(count))
+
+
+@pytest.mark.parametrize(("counts", "stop"), [([3], ((1.0, 2.0),)), ([3, 4, 5], ())])
+def test_clouds_of_an_earlier_run_with_more_scans_go(publish, tmp_path, counts, stop):
+    publish([5, 6, 7])
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    publish(counts, stop)
+    clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(counts))] if stop else []
+    assert held(tmp_path) == [*clouds, "notes.txt", "spectrum.json"]
+
+
+def test_a_run_that_fails_leaves_the_earlier_one(publish, tmp_path, monkeypatch):
+    publish([5, 6])
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    monkeypatch.setattr(publish_spectrum, "without_bands", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        publish([1])
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+
+
+def test_a_cloud_of_that_name_that_is_no_result_stays(publish, tmp_path):
+    """Without a spectrum.json beside it, nobody knows whose it is."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "band_stopped_9.ply").write_text("mine")
+    publish([5])
+    assert (tmp_path / "out" / "band_stopped_9.ply").read_text() == "mine"
+
+
+@pytest.mark.parametrize("stopped", [None, SimpleNamespace(removed=np.zeros(4))])
+def test_a_band_that_is_not_of_these_points_is_refused(stopped):
+    one = scan("s", 5)
+    one.stopped = stopped
+    with pytest.raises(ConfigurationError, match="'s': no band was stopped, or its trigger start"):
+        without_bands(one)
+
+
+def test_the_folder_of_another_command_is_refused(publish, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").write_text("{}")
+    with pytest.raises(FileError, match=r"result of another command \(summary.json\)"):
+        publish([5])

@@ -1,0 +1,123 @@
+"""Numbers as text: prefixes, rounding, and which rows a table has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from omsm_ros.readable import NOTHING
+from omsm_ros.report import tables
+
+
+def test_part_finds_what_is_there_and_nothing_else():
+    nested = {"a": {"b": 3}, "c": 4}
+    assert tables.part(nested, "a", "b") == 3
+    assert tables.part(nested, "a", "x") is None
+    assert tables.part(nested, "c", "b") is None
+
+
+class TestErrorTable:
+    def test_names_before_and_after(self, summary):
+        rows = {row[0]: list(row[1:]) for row in tables.error_table(summary).rows}
+        assert rows["deviation from nominal, rms, every point alike"] == ["184 nm", "17.5 nm"]
+        assert rows["dynamic error, peak to valley"] == ["1.23 µm", "8.70 nm"]
+        assert rows["standard uncertainty of a height, largest"] == ["", "12.5 nm"]
+
+    def test_leaves_out_what_is_unknown(self, summary):
+        del summary["deviation"], summary["uncertainty"]
+        rows = tables.error_table(summary).rows
+        assert {row[0] for row in rows} == {"dynamic error, peak to valley", "dynamic error, rms"}
+        assert tables.error_table({}).rows == []
+
+    def test_an_unknown_after_is_a_dash(self, summary):
+        summary["dynamic_error_after"] = None
+        rows = {row[0]: row[2] for row in tables.error_table(summary).rows}
+        assert rows["dynamic error, rms"] == NOTHING
+
+
+class TestSampleTable:
+    def test_has_a_row_a_reason_and_a_column_a_stream(self, summary):
+        summary["samples"]["distance"]["counted"] = {"invalid": 7, "settling": 33}
+        table = tables.sample_table(summary)
+        assert table.columns == ("axes", "distance")
+        assert ("settling", "40", "33") in table.rows
+        assert ("invalid", "0", "7") in table.rows
+
+    def test_what_waits_is_shown_only_if_something_does(self, summary):
+        assert "still pending" not in {row[0] for row in tables.sample_table(summary).rows}
+        summary["samples"]["axes"]["pending"] = 3
+        assert ("still pending", "3", "0") in tables.sample_table(summary).rows
+
+    def test_without_an_account_there_are_no_rows(self):
+        assert not tables.sample_table({}).rows
+
+
+class TestCalibrationTable:
+    def test_has_what_a_metrologist_asks_for(self, certified):
+        certificate = {
+            **certified.certificate,
+            "static_gain_uncertainty": 3.4e-6,
+            "low_frequency_delay_s": 339.7e-6,
+            "low_frequency_delay_uncertainty_s": 1.13e-6,
+        }
+        given_calibration = replace(certified, certificate=certificate)
+        rows = dict(tables.calibration_table(given_calibration).rows)
+        assert rows["static gain, probe per encoder"] == "0.9921260 ± 0.0000034"
+        assert rows["delay of slow motion"] == "339.7 µs ± 1.1 µs"
+        assert rows["trusted up to"] == "100 Hz"
+        assert rows["chi-square per degree of freedom"] == "1.01"
+        assert rows["verdict"] == "accepted up to 100 Hz"
+        # Eq. 12: 804 Hz of damping 0.19, and a real pole at 49 761 rad/s.
+        assert rows["mode 1"] == "804 Hz, damping 0.192"
+        assert rows["mode 2"] == "7.92 kHz, damping 1.00"
+
+    def test_leaves_out_what_the_certificate_does_not_say(self, certified):
+        rows = dict(tables.calibration_table(replace(certified, certificate={})).rows)
+        assert "verdict" not in rows
+        assert "edges used" not in rows
+        assert rows["delay of slow motion"] == "339.7 µs"
+
+    def test_remarks_are_reasons_and_warnings(self, certified):
+        certificate = {"reasons": ["one"], "warnings": ["two", "three"]}
+        table = tables.remarks_table(replace(certified, certificate=certificate))
+        assert [*table.rows] == [("one",), ("two",), ("three",)]
+
+
+def test_a_mapping_keeps_its_names_and_writes_its_values_as_json():
+    table = tables.mapping_table(
+        "Settings", {"probe_rate": 1000, "on": True, "name": "B", "x": [1]}
+    )
+    assert table.rows == [("probe_rate", "1000"), ("on", "true"), ("name", "B"), ("x", "[1]")]
+
+
+class TestBudgetAndMotion:
+    def test_the_largest_part_comes_first_and_what_nobody_looked_at_is_there(self):
+        def row(source, size, height, status="evaluated"):
+            return {
+                "source": source, "says": "of it", "kind": "random", "status": status,
+                "standard_uncertainty": size, "unit": "m", "height": height, "reason": "because",
+            }  # fmt: skip
+
+        sources = [
+            row("tilt_of_it", None, None, "not evaluated"),
+            row("encoder_noise", 2e-9, 1e-9),
+            row("probe_noise", 1e-8, 1e-8),
+        ]
+        rows = tables.budget_table({"budget": {"sources": sources}}).rows
+        names = [row[0].split(" (")[0] for row in rows]
+        assert names == ["probe noise", "encoder noise", "tilt of it"]
+        assert rows[0][2] == "10.0 nm"
+        assert rows[1][1] == "2.00 nm"
+        assert rows[2][1:3] == ("–", "–")
+        assert rows[2][4] == "not evaluated: because"
+        assert tables.budget_table({}).rows == []
+
+    def test_motion_says_how_much_faster(self):
+        summary = {
+            "prediction": {"residual": 2e-9, "outside_band_fraction": 0.0012, "speed_factor": 3.25},
+            "discretisation": {"peak_to_valley": 5e-14},
+        }
+        rows = dict(tables.motion_table(summary).rows)
+        assert rows["left by the uncertain dynamics, k = 1"] == "2.00 nm"
+        assert rows["motion beyond the trusted band"] == "0.12 %"
+        assert rows["could have run faster by"] == "3.25 ×"
+        assert tables.motion_table({}).rows == []
