@@ -10,7 +10,7 @@ them into one line on stderr and exit status 2::
     ├── ConfigurationError   (ValueError)  a parameter or setting makes no sense
     ├── FileError            (ValueError)  a file is missing, truncated or foreign
     │   ├── BagError                       a recording
-    │   ├── CalibrationError               a calibration, or its use where it does not belong
+    │   ├── CalibrationError               a calibration, or its use with other data
     │   └── SurfaceError                   a nominal surface description
     ├── ProtocolError        (ValueError)  bytes that no device of this kind sends
     └── DeviceError          (OSError)     a device that is absent, silent or lost
@@ -18,7 +18,8 @@ them into one line on stderr and exit status 2::
         └── NoSamplesError             connected, but nothing that could be read came
 
 An error carries a code and values; its text, which names the offending value and the remedy, is
-made by :mod:`omsm_ros.messages`. A text given instead of a code stays as it is.
+made by :mod:`omsm_ros.messages`. A text given instead of a code stays as it is. A
+:class:`Notice` carries the same, but is returned instead of raised.
 """
 
 import errno
@@ -38,6 +39,37 @@ def write_texts_with(sentence: Callable[[str, Mapping[str, Any]], str]) -> None:
     _sentence = sentence
 
 
+def text_of(code: str, values: Mapping[str, Any]) -> str:
+    """Return the sentence for ``code``, or code and values where nothing writes sentences."""
+    if _sentence is None:
+        return " ".join([code, *(f"{name}={value!r}" for name, value in values.items())])
+    return _sentence(code, values)
+
+
+class Notice:
+    """A statement for the user that stops nothing, such as a fault found in a recording.
+
+    code: what is stated, as ``room.subject``, or its text;  values: what the text of a code needs
+    """
+
+    __slots__ = ("code", "values")
+
+    def __init__(self, code: str, /, **values: Any) -> None:
+        self.code, self.values = code, values
+
+    def __str__(self) -> str:
+        return text_of(self.code, self.values)
+
+    def __repr__(self) -> str:
+        return f"Notice({self.code!r}, **{self.values!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Notice) and (self.code, self.values) == (other.code, other.values)
+
+    def __hash__(self) -> int:
+        return hash(self.code)
+
+
 class OmsmError(Exception):
     """Base of all deliberate errors of this package.
 
@@ -49,9 +81,7 @@ class OmsmError(Exception):
         self.code, self.values = str(code), values
 
     def __str__(self) -> str:
-        if _sentence is None:
-            return " ".join([self.code, *(f"{k}={v!r}" for k, v in self.values.items())])
-        return _sentence(self.code, self.values)
+        return text_of(self.code, self.values)
 
 
 class DataError(OmsmError, ValueError):
@@ -79,7 +109,7 @@ class BagError(FileError):
 
 
 class CalibrationError(FileError):
-    """A calibration is malformed, altered, or does not belong to these data."""
+    """A calibration is malformed or altered, or was identified for other data."""
 
 
 class SurfaceError(FileError):
@@ -110,17 +140,16 @@ DEBUG = "OMSM_DEBUG"
 
 
 _LONGEST_LINE, _LONGEST_NAME = 1500, 160
-# What stands in quotes, or is one word without any: a path, an argument.
+# A quoted text, or a word without quotes, such as a path or an argument.
 _NAME = re.compile(r"""(?<!\w)(['"])(?:\\.|[^\\])*?\1(?!\w)|[^\s'"]+""")
 
 
 def one_line(text: object) -> str:
-    """Return what an error says in one line that has an end: its middle goes, not the remedy.
+    """Return the text of an error on one line of limited length, shortened in its middle.
 
-    Names and words in it come from outside: they may have any length, of which the beginning and
-    the end are kept, and what would steer a terminal is written out.
+    Names in it come from outside: long ones are shortened, control characters are escaped.
     """
-    # First to where searching it for names takes no time.
+    # Shortened first, because the search for names in a very long text takes time.
     line = shortened(printable(" ".join(str(text).split())), 4 * _LONGEST_LINE)
     line = _NAME.sub(lambda name: shortened(name[0], _LONGEST_NAME), line)
     return shortened(line, _LONGEST_LINE)
@@ -135,14 +164,14 @@ def shortened(text: str, most: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with all that would steer a terminal, ends of lines too, written out."""
+    """Return ``text`` with control characters and line ends escaped."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def too_many_open_files(err: BaseException) -> str:
-    """Return one line about the limit of open files, if it is behind ``err``; empty if it is not.
+    """Return one line about the limit of open files if it caused ``err``, else an empty text.
 
-    A library, or a part of one that cannot be loaded, tells of it in words alone.
+    Libraries report this limit by an error number or only by its text.
     """
     words = os.strerror(errno.EMFILE)
     for cause in _causes(err):
@@ -155,10 +184,10 @@ def too_many_open_files(err: BaseException) -> str:
 
 
 MORE_FILES = "give it more with 'ulimit -n 1024' in this shell"
-"""What to do where the limit of open files is too low."""
+"""Remedy where the limit of open files is too low."""
 
 FEWEST_OPEN_FILES = 64
-"""A node of ROS 2 holds some twenty, a bag of many parts and a report as many again."""
+"""A node of ROS 2 opens about 20 files, a bag in many parts and a report 20 more."""
 
 
 def open_files() -> float:
@@ -168,7 +197,7 @@ def open_files() -> float:
 
 
 def _causes(err: BaseException) -> Iterator[BaseException]:
-    """Yield ``err`` and what it was raised from, or in the course of."""
+    """Yield ``err``, its causes and its contexts."""
     known: set[int] = set()
     found: BaseException | None = err
     while found is not None and id(found) not in known:
@@ -178,7 +207,7 @@ def _causes(err: BaseException) -> Iterator[BaseException]:
 
 
 def defect(err: BaseException) -> str:
-    """Return one line about an exception that nobody foresaw: what to report, and how."""
+    """Return one line about an unexpected exception: what to report, and how."""
     trace = err.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

@@ -14,6 +14,8 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | ``{p:chance}`` | ``p = 0.02`` |
 | ``{n:count}`` | number of things, ``290 011`` |
 | ``{factor:plain/2}`` | number without unit, to 2 digits |
+| ``{names:list}`` | items separated by commas |
+| ``{source:words}`` | name with spaces instead of underscores |
 | ``{opt.dwell}`` | ``--dwell``, ``parameter 'dwell'`` or ``'dwell'``, for the audience |
 
 To add a message, add its code and template to the dictionary of its room in this package.
@@ -91,4 +93,8 @@ class _Formatter(string.Formatter):
             return readable.chance(value)
         if kind == "count":
             return readable.count(value)
+        if kind == "list":
+            return ", ".join(map(str, value)) or "none"
+        if kind == "words":
+            return str(value).replace("_", " ")
         return str(super().format_field(value, format_spec))
